@@ -1,0 +1,17 @@
+"""EqR: equivariant representations for data-efficient reinforcement learning, on Stable-Baselines3."""
+
+from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
+from sb3_eqr.common.groups import MatrixLieGroup, make_group
+from sb3_eqr.eqr_qrdqn import EqRQRDQN
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "EqRQRDQN",
+    "GroupFeaturesExtractor",
+    "MatrixLieGroup",
+    "PrioritizedSequenceReplayBuffer",
+    "SequenceReplayBuffer",
+    "make_group",
+]

@@ -1,0 +1,32 @@
+"""Image augmentation (paper §6.1 and Table 5): every image of the batch gets its own draw, from torch's generator."""
+
+import torch as th
+
+
+def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
+    """
+    Shift each image by up to ``pad`` pixels in each direction, repeating the edge (Yarats et al. 2021,
+    https://arxiv.org/abs/2004.13649; padding and cropping in one gather, whatever the dtype).
+
+    :param images: (B, C, H, W), any dtype
+    :param pad: pixels, ≥ 0; Table 5 uses 4
+    :return: same shape and dtype
+    """
+    batch, channels, height, width = images.shape
+    dy, dx = th.randint(-pad, pad + 1, (2, batch, 1), device=images.device)
+    rows = (th.arange(height, device=images.device) + dy).clamp(0, height - 1)  # (B, H)
+    columns = (th.arange(width, device=images.device) + dx).clamp(0, width - 1)  # (B, W)
+    pixels = (rows[:, :, None] * width + columns[:, None, :]).view(batch, 1, -1)  # (B, 1, H * W)
+    return images.flatten(2).gather(2, pixels.expand(-1, channels, -1)).view_as(images)
+
+
+def random_intensity(images: th.Tensor, scale: float) -> th.Tensor:
+    """
+    Multiply each image by 1 + scale · clip(ε, −2, 2), ε ~ N(0, 1) (Schwarzer et al. 2021, https://arxiv.org/abs/2007.05929).
+
+    :param images: (B, C, H, W), uint8 or floating point
+    :param scale: ≥ 0; Table 5 uses 0.05
+    :return: same shape, float32 (or the images' own floating dtype), not clipped
+    """
+    noise = th.randn(images.shape[0], 1, 1, 1, device=images.device).clamp_(-2.0, 2.0)
+    return images * (1.0 + scale * noise)

@@ -1,0 +1,452 @@
+"""The one training loop of every EqR agent (Algorithm 1)."""
+
+import io
+import pathlib
+import pickle
+import zipfile
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from torch import nn
+
+from sb3_eqr.common.augmentations import random_intensity, random_shift
+from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.save_util import atomic_write, get_rng_state, set_rng_state
+from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
+from sb3_eqr.common.update_monitor import UpdateMonitor
+
+
+class TDLoss(NamedTuple):
+    """What a Q head makes of a batch of B samples."""
+
+    loss: th.Tensor  # (B,)
+    priorities: th.Tensor  # (B,), ≥ 0, no gradient
+    q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
+
+
+METRICS = ("td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value")
+
+
+class EqRAlgorithm(OffPolicyAlgorithm):
+    """
+    Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
+    one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
+
+    For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
+    """
+
+    policy: EqRPolicy
+    replay_buffer: SequenceReplayBuffer | None
+    target_update_interval: int | None
+
+    def __init__(
+        self,
+        policy: str | type[EqRPolicy],
+        env: GymEnv | str,
+        *,
+        prediction_depth: int,
+        aet_coef: float,
+        get_coef: float,
+        reward_coef: float,
+        reward_loss: str,
+        double_q: bool,
+        prioritized_replay: bool,
+        priority_alpha: float,
+        priority_beta: float,
+        shift_pixels: int,
+        intensity_scale: float,
+        policy_kwargs: dict[str, Any] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        **base_kwargs: Any,
+    ):
+        # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
+        policy_kwargs = dict(policy_kwargs or {})
+        if "optimizer_class" not in policy_kwargs:
+            policy_kwargs["optimizer_class"] = th.optim.Adam
+            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **policy_kwargs.get("optimizer_kwargs", {})}  # Table 5
+        super().__init__(
+            policy,
+            env,
+            policy_kwargs=policy_kwargs,
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
+            _init_setup_model=False,  # type: ignore[call-arg]
+            **base_kwargs,
+        )
+        self.prediction_depth = prediction_depth
+        self.aet_coef = aet_coef
+        self.get_coef = get_coef
+        self.reward_coef = reward_coef
+        self.reward_loss = reward_loss
+        self.double_q = double_q
+        self.prioritized_replay = prioritized_replay
+        self.priority_alpha = priority_alpha
+        self.priority_beta = priority_beta
+        self.shift_pixels = shift_pixels
+        self.intensity_scale = intensity_scale
+        self.frame_stack = 1
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if not isinstance(wrapped.action_space, spaces.Discrete):
+            raise AssertionError(  # SB3's type for an unsupported action space
+                f"The algorithm only supports {spaces.Discrete} as action space, because the Q head has one output per "
+                f"action, but {wrapped.action_space} was provided. Wrap the environment with discrete actions, "
+                "or use an algorithm for that space (SAC, TQC, PPO)."
+            )
+        return wrapped
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.env is not None:
+            self.frame_stack = self._find_frame_stack()
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        # SB3's set-up rejects n-step Dict replay, knows no target per gradient step and no latent model:
+        # it is shown values that it can take, and gets the true ones back.
+        shown = {
+            "n_steps": 1,
+            "target_update_interval": self.target_update_interval or self.n_envs,
+            "policy_kwargs": {**self.policy_kwargs, "latent_model_kwargs": self._latent_model_kwargs()},
+        }
+        true = {name: getattr(self, name) for name in shown}
+        self.__dict__.update(shown)
+        super()._setup_model()
+        self.__dict__.update(true)
+
+        self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
+        self._target_is_online = self._find_whether_target_is_online()
+        self._monitor = UpdateMonitor(METRICS, self.policy, self.policy.optimizer)
+        obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
+        obs_spaces = obs_spaces or {"": self.observation_space}
+        float_images = not self.policy.normalize_images
+        self._image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
+
+    def _check_arguments(self) -> None:
+        base = self.policy_aliases["MlpPolicy"]
+        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, base)):
+            raise ValueError(
+                f"{type(self).__name__}: expected a policy derived from {base.__name__}, found {self.policy_class}. "
+                f"Use one of {list(self.policy_aliases)}; a file is loaded by the class that saved it."
+            )
+        if not isinstance(self.prediction_depth, int) or self.prediction_depth < 0:
+            raise ValueError(f"prediction_depth: expected a whole number of at least 0, found {self.prediction_depth!r}")
+        for name in ("aet_coef", "get_coef", "reward_coef", "shift_pixels", "intensity_scale"):
+            if not (getattr(self, name) >= 0 and np.isfinite(getattr(self, name))):
+                raise ValueError(f"{name}: expected a finite number of at least 0, found {getattr(self, name)!r}")
+        if self.depth > 0 and self.batch_size < 2:
+            raise ValueError(
+                f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
+                "Pass a larger batch_size or prediction_depth=0."
+            )
+        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, SequenceReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class: expected SequenceReplayBuffer or a class derived from it, found "
+                f"{self.replay_buffer_class.__name__}. Leave it out to get the one that prioritized_replay asks for."
+            )
+
+    @property
+    def depth(self) -> int:
+        """M as it is used: 0 where no auxiliary loss is on."""
+        return self.prediction_depth if self.aet_coef or self.get_coef or self.reward_coef else 0
+
+    def _latent_model_kwargs(self) -> dict[str, Any] | None:
+        if self.depth == 0:
+            return None
+        return {
+            "reward_loss": self.reward_loss if self.reward_coef else None,
+            "with_symmetry": self.get_coef > 0,
+        }
+
+    def _find_frame_stack(self) -> int:
+        stack = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
+        is_stack = isinstance(stack, VecFrameStack) and is_image_space(self.observation_space)
+        found = stack.stacked_obs.n_stack if is_stack else 1  # type: ignore[union-attr]
+        return self.replay_buffer_kwargs.get("frame_stack", found)
+
+    def _make_replay_buffer(self) -> SequenceReplayBuffer:
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = (
+                PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
+            )
+        kwargs: dict[str, Any] = {"n_steps": self.n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
+        if issubclass(self.replay_buffer_class, PrioritizedSequenceReplayBuffer):
+            kwargs.update(alpha=self.priority_alpha, beta=self.priority_beta)
+        kwargs.update(self.replay_buffer_kwargs)
+        kwargs["frame_stack"] = self.frame_stack
+        return self.replay_buffer_class(
+            self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
+        )
+
+    def _find_whether_target_is_online(self) -> bool:
+        """
+        Whether target features are online features: the target is copied after every update, and the encoder does not
+        depend on train mode. Then one pass serves for both.
+        """
+        moody = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
+        encoder = self.policy.online.features_extractor
+        copied = self.tau == 1.0 and self.target_update_interval is None
+        return copied and not any(isinstance(module, moody) for module in encoder.modules())
+
+    def _on_step(self) -> None:
+        """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
+        self._n_calls += 1
+        interval = self.target_update_interval
+        if interval is not None and self._n_calls % max(interval // self.n_envs, 1) == 0:
+            self.policy.update_target(self.tau)
+        self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        :param gradient_steps: number of updates
+        :param batch_size: B
+        """
+        buffer = self.replay_buffer
+        assert buffer is not None
+        self._monitor.collect(self._n_updates)
+        # A schedule may have moved these since the last call.
+        buffer.n_steps, buffer.gamma, buffer.prediction_depth = self.n_steps, self.gamma, self.depth
+        if not buffer.can_sample():
+            return  # the first window is not complete yet
+        if isinstance(buffer, PrioritizedSequenceReplayBuffer):
+            buffer.beta = 1.0 - (1.0 - self.priority_beta) * max(self._current_progress_remaining, 0.0)
+            self.logger.record("train/beta", buffer.beta)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        self._monitor.start_round()
+        for _ in range(gradient_steps):
+            self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _update(self, samples: SequenceReplayBufferSamples) -> None:
+        """One gradient step, the target, the priorities."""
+        td, auxiliary = self._compute_losses(samples)
+        per_sample = td.loss  # (B,)
+        for coef, part in zip((self.aet_coef, self.get_coef, self.reward_coef), auxiliary, strict=True):
+            if part is not None and coef > 0:
+                per_sample = per_sample + coef * part
+        loss = (samples.weights * per_sample).mean()
+
+        self.policy.optimizer.zero_grad()
+        loss.backward()
+        max_norm = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+        grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
+        self.policy.optimizer.step()
+        self._n_updates += 1
+        if self.target_update_interval is None:
+            self.policy.update_target(self.tau)
+        if isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
+            self.replay_buffer.update_priorities(samples.indices, td.priorities)
+        with th.no_grad():
+            losses = (td.loss, *(loss.new_zeros(1) if part is None else part for part in auxiliary))
+            self._monitor.add([*(part.mean() for part in losses), loss.detach(), grad_norm, td.q_values.mean()])
+
+    def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss, LatentLosses]:
+        """
+        One features pass for s_t serves both; one target pass covers every other observation.
+
+        :return: losses per sample
+        """
+        policy = self.policy
+        batch_size = len(samples.actions)
+        observations = self._augment(samples.observations)
+        features = policy.online.features(observations)  # (B, D)
+        with th.no_grad():
+            others = [samples.next_observations]
+            if samples.rollout_observations is not None:
+                others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
+            other_observations = self._augment(_cat(others))
+            other_features = policy.target.features(other_observations)  # (B + B * M, D)
+            next_target = next_online = other_features[:batch_size]
+            if self.double_q and not self._target_is_online:
+                next_online = policy.online.features(_map(lambda obs: obs[:batch_size], other_observations))
+        td = self._td_loss(samples, features, next_online, next_target)
+        if samples.mask is None or policy.latent_model is None:
+            return td, LatentLosses(None, None, None)
+        with th.no_grad():
+            now = features.detach() if self._target_is_online else policy.target.features(observations)
+            rollout = other_features[batch_size:].unflatten(0, samples.mask.shape)  # (B, M, D)
+        assert policy.latent_model_target is not None
+        auxiliary = policy.latent_model(
+            features,
+            samples.rollout_actions,
+            samples.rollout_rewards,
+            samples.mask,
+            th.cat([now[:, None], rollout], dim=1),  # (B, M + 1, D)
+            policy.latent_model_target,
+            policy.project,
+            policy.target_project,
+        )
+        return td, auxiliary
+
+    @abstractmethod
+    def _td_loss(
+        self,
+        samples: SequenceReplayBufferSamples,
+        features: th.Tensor,
+        next_online: th.Tensor,
+        next_target: th.Tensor,
+    ) -> TDLoss:
+        """
+        The Q head's own loss.
+
+        :param samples: the batch
+        :param features: of s_t, online, (B, D)
+        :param next_online: of the n-step transition's last observation, online, no gradient, (B, D): double Q chooses by it
+        :param next_target: the same from the target, (B, D)
+        """
+
+    def _augment(self, observations: PyTorchObs) -> PyTorchObs:
+        if isinstance(observations, dict):
+            return {
+                key: self._augment_images(obs) if key in self._image_keys else obs for key, obs in observations.items()
+            }
+        return self._augment_images(observations) if self._image_keys else observations
+
+    def _augment_images(self, images: th.Tensor) -> th.Tensor:
+        if self.shift_pixels > 0:
+            images = random_shift(images, self.shift_pixels)
+        return random_intensity(images, self.intensity_scale) if self.intensity_scale > 0 else images
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        self._check_finite("observation", self._last_obs)  # before the first step
+        return result
+
+    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:  # type: ignore[override]
+        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
+        normalize = self._vec_normalize_env
+        self._check_finite("observation", new_obs if normalize is None else normalize.get_original_obs())
+        self._check_finite("reward", reward if normalize is None else normalize.get_original_reward())
+        for info in infos:
+            if info.get("terminal_observation") is not None:
+                self._check_finite("terminal observation", info["terminal_observation"])
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, what: str, values: Any) -> None:
+        for key, array in values.items() if isinstance(values, dict) else [("", values)]:
+            if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
+                found = np.asarray(array)[~np.isfinite(array)].flat[0]
+                raise ValueError(
+                    f"step {self.num_timesteps}: expected finite {what}s from the environment, found {found} in the {what}"
+                    f"{' ' + repr(key) if key else ''}. It was not stored and the model is as before. Mend the environment; "
+                    "SB3's VecCheckNan tells which action led there."
+                )
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "EqR",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ):
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._monitor.collect(self._n_updates)
+        return self
+
+    def dump_logs(self) -> None:
+        """Write log data. Only here are the losses read from the device: the mean over all updates since the last time."""
+        self._monitor.collect(self._n_updates)
+        for name, value in self._monitor.means().items():
+            self.logger.record(f"train/{name}", value)
+        super().dump_logs()
+
+    def save(self, path, exclude=None, include=None) -> None:
+        """
+        As SB3's ``save``, with the state of the random generators, and never by half: the file is written beside and renamed.
+
+        :param path: path to the file, or a file-like
+        :param exclude: names of attributes to leave out beside the default ones
+        :param include: names of attributes to save although they are left out by default
+        """
+        self._monitor.collect(self._n_updates)
+        self.rng_state = get_rng_state(self.action_space)
+        if not isinstance(path, (str, pathlib.Path)):
+            super().save(path, exclude, include)
+            return
+        with atomic_write(path, "zip") as file:
+            super().save(file, exclude, include)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path, env=None, device="auto", custom_objects=None, print_system_info=False, force_reset=True, **kwargs):
+        """
+        As SB3's ``load``. Where the model has a seed, the random generators are put back to where they were at saving,
+        so that a run goes on as if it had not stopped (pass ``force_reset=False`` and the same environment state).
+
+        :raises ValueError: if the file is cut off, or was saved by another class
+        """
+        if isinstance(path, (str, pathlib.Path)):
+            found = next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
+            if found is not None and not zipfile.is_zipfile(found):
+                raise ValueError(
+                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or no zip file. "
+                    "Load an earlier checkpoint."
+                )
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if model.seed is not None and getattr(model, "rng_state", None) is not None:
+            set_rng_state(model.rng_state, model.action_space)
+        return model
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        As SB3's, but never by half: the file is written beside and renamed.
+
+        :param path: path to the file, or a file-like
+        """
+        if not isinstance(path, (str, pathlib.Path)):
+            super().save_replay_buffer(path)
+            return
+        with atomic_write(path, "pkl") as file:
+            super().save_replay_buffer(file)  # type: ignore[arg-type]
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        As SB3's.
+
+        :param path: path to the file, or a file-like
+        :param truncate_last_traj: has no effect here
+        :raises ValueError: if the file is cut off, or holds a buffer for other observations, actions or environments;
+            the model then keeps the buffer it had
+        """
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except (EOFError, pickle.UnpicklingError, AssertionError) as error:
+            self.replay_buffer = before
+            raise ValueError(
+                f"{path}: expected a whole replay buffer saved by {type(self).__name__}.save_replay_buffer, "
+                f"found one that is cut off or something else ({error}). Load an earlier one."
+            ) from error
+        loaded, self.replay_buffer = self.replay_buffer, before
+        expected = (SequenceReplayBuffer, self.observation_space, self.action_space, self.n_envs)
+        found = (type(loaded), loaded.observation_space, loaded.action_space, loaded.n_envs)  # type: ignore[union-attr]
+        if not isinstance(loaded, SequenceReplayBuffer) or expected[1:] != found[1:]:
+            raise ValueError(f"{path}: expected a replay buffer for {expected}, found {found}. Load the one of this model.")
+        self.replay_buffer = loaded
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "_target_is_online", "_image_keys"]
+
+
+def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:
+    if isinstance(observations, dict):
+        return {key: function(obs) for key, obs in observations.items()}
+    return function(observations)
+
+
+def _cat(observations: list[PyTorchObs]) -> PyTorchObs:
+    if isinstance(observations[0], dict):
+        return {key: th.cat([obs[key] for obs in observations]) for key in observations[0]}  # type: ignore[index, call-overload]
+    return th.cat(observations)  # type: ignore[arg-type]

@@ -1,0 +1,150 @@
+"""Observations kept once: frames in one array, each stored transition holding the indices of its own."""
+
+from typing import Any
+
+import numpy as np
+
+_ZERO = 0  # slot 0 always holds zeros: VecFrameStack pads the first observations of an episode with them
+
+
+class FrameStore:
+    """
+    A ring of (observation, next observation) pairs, per environment, in which every frame is stored once.
+
+    An observation is a stack of ``n_stack`` frames along its first axis (1: no stack, stored whole). A pair holds the
+    indices of its n_stack + 1 frames; consecutive pairs of an episode share all but the newest. Frames are reference
+    counted, so what an overwritten pair alone used is free for the next one. Contents are compared bit by bit before
+    they are shared: what comes out is what went in, whatever resets, pads or truncates episodes.
+
+    :param n_positions: length of the ring
+    :param n_envs: environments, stored side by side
+    :param obs_shape: shape of one observation; the first axis must be divisible by ``n_stack``
+    :param dtype: of the observations
+    :param n_stack: frames per observation
+    """
+
+    def __init__(self, n_positions: int, n_envs: int, obs_shape: tuple[int, ...], dtype: np.dtype, n_stack: int = 1):
+        self.n_stack = n_stack
+        self.obs_shape = obs_shape
+        self._frame_shape = (obs_shape[0] // n_stack, *obs_shape[1:])
+        self._ids = np.zeros((n_positions, n_envs, n_stack + 1), dtype=np.int32)
+        # One frame per transition, and one more per episode: the array grows where episodes are short.
+        n_transitions = n_positions * n_envs
+        self._allocate_arrays(1 + n_transitions + n_transitions // 64 + n_envs * (n_stack + 1), np.dtype(dtype))
+        self._n_used = 1  # slots below this have been handed out at some time
+        self._n_free = 0  # of these, the ones given back: the first entries of _free
+
+    def _allocate_arrays(self, capacity: int, dtype: np.dtype) -> None:
+        self._frames = np.zeros((capacity, *self._frame_shape), dtype=dtype)
+        self._references = np.zeros(capacity, dtype=np.int32)
+        self._free = np.zeros(capacity, dtype=np.int32)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, in bytes."""
+        return self._frames.nbytes + self._references.nbytes + self._free.nbytes + self._ids.nbytes
+
+    def add(self, position: int, obs: np.ndarray, next_obs: np.ndarray, overwrite: bool) -> np.ndarray:
+        """
+        Store one pair per environment.
+
+        :param position: where in the ring; positions are written in order
+        :param obs: (n_envs, *obs_shape)
+        :param next_obs: (n_envs, *obs_shape)
+        :param overwrite: whether the ring holds an older pair here
+        :return: whether ``obs`` is the next observation of the pair before, (n_envs,)
+        :raises ValueError: if ``next_obs`` is not ``obs`` moved on by one frame
+        """
+        stacks, next_stacks = self._as_stacks(obs), self._as_stacks(next_obs)  # (n_envs, n_stack, *frame_shape)
+        if not np.array_equal(_bits(stacks[:, 1:]), _bits(next_stacks[:, :-1])):
+            raise ValueError(
+                f"frame_stack={self.n_stack}: expected each observation to be the previous one with its oldest frame "
+                "dropped and one frame appended along the first axis, found another order. "
+                'Pass replay_buffer_kwargs={"frame_stack": 1} to store observations whole.'
+            )
+        if overwrite:
+            self._release(self._ids[position])
+        before = self._ids[position - 1]
+        same = _bits(self._frames[before[:, 1:]]) == _bits(stacks)
+        continues = same.reshape(len(stacks), -1).all(axis=1)
+        ids = np.empty_like(before)
+        ids[:, :-1] = before[:, 1:]
+        for env in np.flatnonzero(~continues):  # the first step of an episode
+            ids[env, :-1] = self._store_stack(stacks[env])
+        ids[:, -1] = self._take_slots(len(stacks))
+        self._frames[ids[:, -1]] = next_stacks[:, -1]
+        np.add.at(self._references, ids, 1)
+        self._ids[position] = ids
+        return continues
+
+    def observations(self, positions: np.ndarray, envs: np.ndarray) -> np.ndarray:
+        """
+        :param positions: (...)
+        :param envs: (...), broadcast against ``positions``
+        :return: observations, (..., *obs_shape), a copy
+        """
+        return self._gather(self._ids[positions, envs, :-1])
+
+    def next_observations(self, positions: np.ndarray, envs: np.ndarray) -> np.ndarray:
+        """As :meth:`observations`, for the observation after."""
+        return self._gather(self._ids[positions, envs, 1:])
+
+    def _gather(self, ids: np.ndarray) -> np.ndarray:
+        return self._frames[ids].reshape(*ids.shape[:-1], *self.obs_shape)
+
+    def _as_stacks(self, obs: np.ndarray) -> np.ndarray:
+        return np.asarray(obs, dtype=self._frames.dtype).reshape(len(obs), self.n_stack, *self._frame_shape)
+
+    def _store_stack(self, stack: np.ndarray) -> list[int]:
+        ids: list[int] = []
+        for k, frame in enumerate(stack):
+            if self.n_stack > 1 and not _bits(frame).any():
+                ids.append(_ZERO)
+            elif k > 0 and np.array_equal(_bits(frame), _bits(stack[k - 1])):  # padded with the first frame
+                ids.append(ids[-1])
+            else:
+                ids.append(int(self._take_slots(1)[0]))
+                self._frames[ids[-1]] = frame
+        return ids
+
+    def _take_slots(self, count: int) -> np.ndarray:
+        reused = min(count, self._n_free)
+        self._n_free -= reused
+        slots = self._free[self._n_free : self._n_free + reused]
+        fresh = np.arange(self._n_used, self._n_used + count - reused, dtype=np.int32)
+        self._n_used += count - reused
+        if self._n_used > len(self._frames):
+            self._grow()
+        return np.concatenate([slots, fresh])
+
+    def _grow(self) -> None:
+        capacity = self._n_used + len(self._frames) // 16
+        for array in (self._frames, self._references, self._free):  # in place: the system moves pages, not bytes
+            array.resize((capacity, *array.shape[1:]), refcheck=False)
+
+    def _release(self, ids: np.ndarray) -> None:
+        np.subtract.at(self._references, ids, 1)
+        self._references[_ZERO] = 1
+        unused = np.unique(ids[self._references[ids] == 0])
+        self._free[self._n_free : self._n_free + len(unused)] = unused
+        self._n_free += len(unused)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only slots in use are saved, so that a buffer filled to a tenth makes a file of a tenth."""
+        state = self.__dict__.copy()
+        state["_capacity"] = len(self._frames)
+        for name in ("_frames", "_references", "_free"):
+            state[name] = state[name][: self._n_used]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        saved = {name: state.pop(name) for name in ("_frames", "_references", "_free")}
+        capacity = state.pop("_capacity")
+        self.__dict__.update(state)
+        self._allocate_arrays(capacity, saved["_frames"].dtype)
+        for name, array in saved.items():
+            getattr(self, name)[: len(array)] = array
+
+
+def _bits(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).view(np.uint8)

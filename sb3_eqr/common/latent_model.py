@@ -1,0 +1,173 @@
+"""
+The latent model: how actions move states, and the three losses that teach it (EqR, §5 and §6).
+
+It receives tensors, a mask and callables, and knows neither Q-learning nor Atari.
+Shapes: B batch, M prediction depth, K blocks, D size of the flat state, A number of actions.
+"""
+
+from collections.abc import Callable
+from math import prod
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_eqr.common.groups import Group
+from sb3_eqr.common.losses import normalized_distance, reward_cross_entropy, reward_mse
+from sb3_eqr.common.type_aliases import LatentLosses
+
+Projection = Callable[[th.Tensor], th.Tensor]
+
+# name -> (outputs of the reward network, loss)
+REWARD_LOSSES = {"mse": (1, reward_mse), "categorical": (3, reward_cross_entropy)}
+
+
+class LatentModel(nn.Module):
+    """
+    κ (actions to group elements), r_ψ (reward), ρ (how a symmetry of states acts on actions) and b (its projection).
+
+    :param group: of each block
+    :param n_blocks: K
+    :param n_actions: A
+    :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
+    :param reward_loss: "mse" (Eq. 17), "categorical" (three signs, as in the authors' released code),
+        ``None``: no reward network
+    :param with_symmetry: whether to build ρ and b, for the GET loss
+    :raises ValueError: for an unknown reward loss, or ``with_symmetry`` with a group that has no inverse
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        n_blocks: int,
+        n_actions: int,
+        hidden_dim: int = 256,
+        reward_loss: str | None = "mse",
+        with_symmetry: bool = True,
+    ):
+        super().__init__()
+        if reward_loss is not None and reward_loss not in REWARD_LOSSES:
+            raise ValueError(f"reward_loss: expected one of {list(REWARD_LOSSES)}, found {reward_loss!r}")
+        if with_symmetry and not group.has_inverse:
+            raise ValueError(
+                f"get_coef: the GET loss needs a group with inverses, found {group}. Pass get_coef=0 or another group."
+            )
+        self.group = group
+        self.n_blocks = n_blocks
+        self.n_actions = n_actions
+        state_dim = n_blocks * prod(group.element_shape)
+        algebra_dim = n_blocks * group.num_params
+        self.transition = _hidden_layer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
+        self.reward_net = None  # r_ψ
+        if reward_loss is not None:
+            n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
+            self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)
+        self.action_symmetry = _hidden_layer(state_dim, hidden_dim, algebra_dim) if with_symmetry else None  # ρ
+        self.projection = nn.Linear(state_dim, hidden_dim) if with_symmetry else None  # b
+
+    def forward(
+        self,
+        state: th.Tensor,
+        actions: th.Tensor,
+        rewards: th.Tensor,
+        mask: th.Tensor,
+        target_states: th.Tensor,
+        target: "LatentModel",
+        project: Projection,
+        target_project: Projection,
+    ) -> LatentLosses:
+        """
+        The losses of Eq. 18 and 19, per sample, each step weighted by the one mask.
+
+        :param state: x₀ = τ(s_t), online, (B, D)
+        :param actions: a_t ... a_{t+M-1}, int64, (B, M)
+        :param rewards: r_{t+1} ... r_{t+M}, (B, M)
+        :param mask: 1 where the episode had not ended before step t+m, (B, M)
+        :param target_states: x̄₀ ... x̄_M from the target encoder, without gradient, (B, M + 1, D)
+        :param target: the target copy of this model, in eval mode, its parameters frozen
+        :param project: p, (..., D) -> (..., P)
+        :param target_project: p̄
+        :return: three losses, (B,) each; ``None`` for a part that was not built
+        """
+        # Past the end there is no action: a constant one keeps the mask's promise even through batch statistics.
+        one_hot = F.one_hot((actions * mask.long()).long(), self.n_actions).to(state.dtype)  # (B, M, A)
+        predicted = self.rollout(state, one_hot, mask)  # (B, M, D)
+        with th.no_grad():
+            target_projected = target_project(target_states[:, 1:])  # (B, M, P)
+        aet = (normalized_distance(project(predicted), target_projected) * mask).sum(dim=1)
+        get = None
+        if self.action_symmetry is not None:
+            get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
+        reward = None
+        if self.reward_net is not None:
+            outputs = self.reward_net(predicted.flatten(0, 1)).unflatten(0, mask.shape)  # (B, M, 1 or 3)
+            reward = (self._reward_loss(outputs, rewards) * mask).sum(dim=1)
+        return LatentLosses(aet, get, reward)
+
+    def rollout(self, state: th.Tensor, one_hot: th.Tensor, mask: th.Tensor) -> th.Tensor:
+        """
+        x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1} (Eq. 10), held where the episode has ended.
+
+        :param state: x₀, (B, D)
+        :param one_hot: actions, (B, M, A)
+        :param mask: (B, M)
+        :return: x̂_1 ... x̂_M, (B, M, D)
+        """
+        states = []
+        for m in range(one_hot.shape[1]):  # each step needs the one before
+            moved = self.act(self.action_element(state, one_hot[:, m]), state)
+            state = th.where(mask[:, m, None] > 0, moved, state)
+            states.append(state)
+        return th.stack(states, dim=1)
+
+    def action_element(self, state: th.Tensor, one_hot: th.Tensor) -> th.Tensor:
+        """
+        κ(x, a).
+
+        :param state: (B, D)
+        :param one_hot: (B, A)
+        :return: K group elements, (B, K, *element_shape)
+        """
+        return self._element(self.transition(th.cat([state, one_hot], dim=1)))
+
+    def act(self, elements: th.Tensor, state: th.Tensor) -> th.Tensor:
+        """
+        :param elements: (B, K, *element_shape)
+        :param state: (B, D)
+        :return: elements · state, (B, D)
+        """
+        return self.group.compose(elements, self._blocks(state)).flatten(1)
+
+    def _symmetry_loss(
+        self, state: th.Tensor, predicted: th.Tensor, one_hot: th.Tensor, target_state: th.Tensor, target: "LatentModel"
+    ) -> th.Tensor:
+        """
+        Eq. 19: τ_g moves the predicted next state; ρ(τ_g) κ̄ moves the partner's state; both should arrive together.
+
+        :param state: x₀, (B, D)
+        :param predicted: x̂₁, (B, D)
+        :param one_hot: a_t, (B, A)
+        :param target_state: x̄₀, (B, D)
+        :return: (B,)
+        """
+        assert self.action_symmetry is not None and self.projection is not None and target.projection is not None
+        partner = target_state[th.randint(len(state), (len(state),), device=state.device)]  # x̄_j of Algorithm 1
+        with th.no_grad():  # τ_g carries no gradient, as in the authors' code
+            inverse = self.group.inverse(self._blocks(state))
+            symmetry = self.group.compose(self._blocks(partner), inverse)  # τ_g, (B, K, ...)
+            target_action = target.action_element(state, one_hot)  # κ̄, (B, K, ...)
+        moved_prediction = self.act(symmetry, predicted)
+        action_map = self._element(self.action_symmetry(symmetry.flatten(1)))  # ρ(τ_g), (B, K, ...)
+        moved_partner = self.act(self.group.compose(action_map, target_action), partner)
+        return normalized_distance(self.projection(moved_prediction), target.projection(moved_partner))
+
+    def _blocks(self, state: th.Tensor) -> th.Tensor:
+        return state.unflatten(1, (self.n_blocks, *self.group.element_shape))  # (B, K, *element_shape)
+
+    def _element(self, params: th.Tensor) -> th.Tensor:
+        return self.group.element(params.unflatten(1, (self.n_blocks, self.group.num_params)))
+
+
+def _hidden_layer(n_in: int, n_hidden: int, n_out: int) -> nn.Sequential:
+    """One hidden layer with batch norm and ReLU: κ, r_ψ and ρ alike (appendix B.4)."""
+    return nn.Sequential(nn.Linear(n_in, n_hidden), nn.BatchNorm1d(n_hidden), nn.ReLU(), nn.Linear(n_hidden, n_out))

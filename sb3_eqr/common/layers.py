@@ -1,0 +1,155 @@
+"""Layers that PyTorch does not have: noisy linear layers, the paper's convolutions, the distributional head."""
+
+from math import sqrt
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+
+class NoisyLinear(nn.Module):
+    """
+    Linear layer with factorised Gaussian noise (Fortunato et al. 2018, Eq. 9 to 11, https://arxiv.org/abs/1706.10295):
+    y = (μ_w + σ_w ⊙ f(ε_out) f(ε_in)ᵀ) x + μ_b + σ_b ⊙ f(ε_out), with f(ε) = sign(ε) √|ε|.
+
+    Noise is asked for per call and drawn afresh each time, from torch's generator: it does not depend on train or eval
+    mode (SB3 explores in eval mode), and there is no noise to store. One draw serves the whole batch.
+
+    :param in_features: size of the input
+    :param out_features: size of the output
+    :param sigma_init: σ₀, ≥ 0; 0.5 in the paper and in Table 5
+    """
+
+    def __init__(self, in_features: int, out_features: int, sigma_init: float = 0.5):
+        super().__init__()
+        bound = 1 / sqrt(in_features)
+        self.weight = nn.Parameter(th.empty(out_features, in_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(out_features).uniform_(-bound, bound))
+        self.weight_sigma = nn.Parameter(th.full((out_features, in_features), sigma_init * bound))
+        self.bias_sigma = nn.Parameter(th.full((out_features,), sigma_init * bound))
+
+    def forward(self, inputs: th.Tensor, noisy: bool = False) -> th.Tensor:
+        """
+        :param inputs: (..., in_features)
+        :param noisy: whether to draw noise; without it, the mean weights
+        :return: (..., out_features)
+        """
+        mean = F.linear(inputs, self.weight, self.bias)
+        if not noisy:
+            return mean
+        noise_in = _signed_sqrt(th.randn(self.weight.shape[1], device=inputs.device, dtype=inputs.dtype))
+        noise_out = _signed_sqrt(th.randn(self.weight.shape[0], device=inputs.device, dtype=inputs.dtype))
+        # Rank-one noise: scaling input and output is the same as building the noisy matrix, and cheaper.
+        return mean + noise_out * F.linear(inputs * noise_in, self.weight_sigma, self.bias_sigma)
+
+
+def _signed_sqrt(noise: th.Tensor) -> th.Tensor:
+    return noise.sign() * noise.abs().sqrt()
+
+
+class MLP(nn.Sequential):
+    """
+    Linear layers with activations between them.
+
+    :param sizes: input size, hidden sizes, output size
+    :param activation_fn: activation after every layer but the last
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    """
+
+    def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
+        modules: list[nn.Module] = []
+        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+            modules += [
+                nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init),
+                activation_fn(),
+            ]
+        super().__init__(*modules[:-1])
+
+    def forward(self, inputs: th.Tensor, noisy: bool = False) -> th.Tensor:
+        for module in self:
+            inputs = module(inputs, noisy) if isinstance(module, NoisyLinear) else module(inputs)
+        return inputs
+
+
+class DistributionalHead(nn.Module):
+    """
+    State features to ``n_atoms`` numbers (quantiles or logits) per action.
+
+    With ``dueling``, a value and an advantage stream, each an MLP of its own (Wang et al. 2016,
+    https://arxiv.org/abs/1511.06581); without it, the advantage stream alone is the head.
+
+    :param features_dim: D
+    :param n_actions: A
+    :param n_atoms: N
+    :param net_arch: hidden sizes
+    :param activation_fn: activation between layers
+    :param dueling: whether to split value from advantage
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        n_actions: int,
+        n_atoms: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module],
+        dueling: bool,
+        sigma_init: float | None,
+    ):
+        super().__init__()
+        self.n_atoms = n_atoms
+        self.n_actions = n_actions
+        self.advantage = MLP([features_dim, *net_arch, n_actions * n_atoms], activation_fn, sigma_init)
+        self.value = MLP([features_dim, *net_arch, n_atoms], activation_fn, sigma_init) if dueling else None
+
+    def forward(self, features: th.Tensor, noisy: bool = False) -> th.Tensor:
+        """
+        :param features: (B, D)
+        :param noisy: draw noise in noisy layers
+        :return: (B, N, A)
+        """
+        advantage = self.advantage(features, noisy).view(-1, self.n_atoms, self.n_actions)
+        if self.value is None:
+            return advantage
+        value = self.value(features, noisy)[:, :, None]  # (B, N, 1)
+        return value + advantage - advantage.mean(dim=2, keepdim=True)
+
+    def project(self, features: th.Tensor) -> th.Tensor:
+        """
+        The projection p of the AET loss: the first layer of every stream, before its activation, noise off (appendix B.4).
+
+        :param features: (..., D)
+        :return: (..., P): P is the first hidden size, twice that if dueling
+        """
+        streams = [self.advantage] if self.value is None else [self.value, self.advantage]
+        return th.cat([stream[0](features) for stream in streams], dim=-1)
+
+
+class ConvTrunk(nn.Sequential):
+    """
+    The three convolutions of Mnih et al. 2015, flattened, without the linear layer (appendix B.4):
+    32 8×8 filters with stride 4, 64 4×4 with stride 2, 64 3×3 with stride 1, a ReLU after each.
+
+    :param in_channels: C
+    """
+
+    def __init__(self, in_channels: int):
+        super().__init__(
+            nn.Conv2d(in_channels, 32, kernel_size=8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU.
+        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: (B, C, H, W), floating point, H and W at least 36
+        :return: (B, features)
+        """
+        return super().forward(images.contiguous(memory_format=th.channels_last))

@@ -1,0 +1,5 @@
+"""Environments. Importing this needs no extra; making an Atari environment needs ``pip install sb3-eqr[atari]``."""
+
+from sb3_eqr.envs.atari import make_atari100k_env
+
+__all__ = ["make_atari100k_env"]

@@ -1,0 +1,88 @@
+"""The Atari-100K protocol of the paper (§7 and Table 5), built of SB3's and gymnasium's wrappers."""
+
+import difflib
+import re
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.atari_wrappers import ClipRewardEnv, EpisodicLifeEnv, MaxAndSkipEnv, NoopResetEnv, WarpFrame
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
+
+NOOP_MAX = 30  # §7, as in SPR: at most 30 no-ops at the start of a game
+FRAME_SKIP = 4  # Table 5, action repetitions
+SCREEN_SIZE = 84  # Table 5
+FRAME_STACK = 4  # Table 5
+MAX_STEPS = 27_000  # Table 5: at most 108K frames per episode
+
+
+def make_atari100k_env(
+    game: str,
+    n_envs: int = 1,
+    seed: int | None = None,
+    training: bool = True,
+    vec_env_cls: Callable[..., VecEnv] = DummyVecEnv,
+    vec_env_kwargs: dict[str, Any] | None = None,
+    monitor_dir: str | None = None,
+) -> VecEnv:
+    """
+    Atari as the paper trains on it: up to 30 no-ops, each action for 4 frames of which the last two are maximised, grey
+    84×84, 4 frames stacked, at most 27,000 agent steps per game, no sticky actions, no FIRE press. In training rewards
+    are clipped to their sign and the loss of a life ends an episode; ``Monitor`` sees the raw score of whole games.
+
+    :param game: "Pong", "PongNoFrameskip-v4" or "ALE/Pong-v5": all the same environment
+    :param n_envs: number of environments
+    :param seed: of the first environment; the others count up
+    :param training: False: rewards raw, an episode is a whole game
+    :param vec_env_cls: ``DummyVecEnv`` or ``SubprocVecEnv``
+    :param vec_env_kwargs: its keyword arguments
+    :param monitor_dir: folder for ``Monitor``'s files
+    :return: observations (84, 84, 4), uint8; SB3 transposes them
+    :raises ImportError: without ale-py or OpenCV
+    :raises ValueError: for a game that there is not, with the nearest names
+    """
+    env_id = atari_env_id(game)
+
+    def make_game() -> gym.Env:
+        # Sticky actions, frame skip and frame limit of ALE itself off: the wrappers do what the protocol says.
+        env = gym.make(env_id, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None)
+        return TimeLimit(MaxAndSkipEnv(NoopResetEnv(env, noop_max=NOOP_MAX), skip=FRAME_SKIP), MAX_STEPS)
+
+    def preprocess(env: gym.Env) -> gym.Env:  # outside Monitor
+        if not training:
+            return WarpFrame(env, width=SCREEN_SIZE, height=SCREEN_SIZE)
+        return ClipRewardEnv(WarpFrame(EpisodicLifeEnv(env), width=SCREEN_SIZE, height=SCREEN_SIZE))
+
+    env = make_vec_env(
+        make_game,
+        n_envs=n_envs,
+        seed=seed,
+        monitor_dir=monitor_dir,
+        wrapper_class=preprocess,
+        vec_env_cls=vec_env_cls,  # type: ignore[arg-type]
+        vec_env_kwargs=vec_env_kwargs,
+    )
+    return VecFrameStack(env, n_stack=FRAME_STACK)
+
+
+def atari_env_id(game: str) -> str:
+    """
+    :param game: see :func:`make_atari100k_env`; case, "_" and spaces do not matter
+    :return: "ALE/<Game>-v5"
+    :raises ImportError: without ale-py
+    :raises ValueError: for a game that there is not
+    """
+    try:
+        import ale_py
+    except ImportError as error:
+        raise ImportError('Atari needs ale-py and OpenCV: pip install "sb3-eqr[atari]"') from error
+    gym.register_envs(ale_py)
+    games = {name[4:-3].lower(): name for name in gym.registry if re.fullmatch(r"ALE/[A-Za-z]+[A-Za-z0-9]*-v5", name)}
+    bare = re.sub(r"^ALE/|(NoFrameskip|Deterministic)?-v\d$|[_ ]", "", game)
+    if bare.lower() not in games:
+        near = difflib.get_close_matches(bare.lower(), games, n=3)
+        hint = f"did you mean {', '.join(games[name][4:-3] for name in near)}?" if near else "see gymnasium.registry"
+        raise ValueError(f"game: expected the name of an Atari game such as 'Pong', found {game!r}; {hint}")
+    return games[bare.lower()]
