@@ -1,0 +1,1 @@
+"""Measuring EqR. ``python -m sb3_eqr.benchmark.speed`` prints what a step costs."""

@@ -145,9 +145,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         """
         follows = np.ones(self.n_envs, dtype=bool)
         for key, store in self._stores.items():
-            now, then = (obs[key], next_obs[key]) if isinstance(obs, dict) else (obs, next_obs)  # type: ignore[index, call-overload]
+            now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
             shape = (self.n_envs, *store.obs_shape)
-            follows &= store.add(self.pos, np.reshape(now, shape), np.reshape(then, shape), overwrite=self.full)
+            follows &= store.add(self.pos, now.reshape(shape), then.reshape(shape), overwrite=self.full)
         # An environment that was reset in the middle of an episode (a second call of learn) cuts it like a time-out.
         self.timeouts[self.pos - 1, ~follows & ~self._episode_starts] = 1.0
 

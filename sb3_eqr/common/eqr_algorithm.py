@@ -13,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 
@@ -47,6 +47,10 @@ class EqRAlgorithm(OffPolicyAlgorithm):
     policy: EqRPolicy
     replay_buffer: SequenceReplayBuffer | None
     target_update_interval: int | None
+    max_grad_norm: float | None
+    exploration_schedule: Schedule
+    exploration_rate: float
+    _n_calls: int
 
     def __init__(
         self,
@@ -175,15 +179,13 @@ class EqRAlgorithm(OffPolicyAlgorithm):
 
     def _make_replay_buffer(self) -> SequenceReplayBuffer:
         if self.replay_buffer_class is None:
-            self.replay_buffer_class = (
-                PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
-            )
+            self.replay_buffer_class = PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
         kwargs: dict[str, Any] = {"n_steps": self.n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
         if issubclass(self.replay_buffer_class, PrioritizedSequenceReplayBuffer):
             kwargs.update(alpha=self.priority_alpha, beta=self.priority_beta)
         kwargs.update(self.replay_buffer_kwargs)
         kwargs["frame_stack"] = self.frame_stack
-        return self.replay_buffer_class(
+        return self.replay_buffer_class(  # type: ignore[return-value]
             self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
         )
 
@@ -308,9 +310,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
 
     def _augment(self, observations: PyTorchObs) -> PyTorchObs:
         if isinstance(observations, dict):
-            return {
-                key: self._augment_images(obs) if key in self._image_keys else obs for key, obs in observations.items()
-            }
+            return {key: self._augment_images(obs) if key in self._image_keys else obs for key, obs in observations.items()}
         return self._augment_images(observations) if self._image_keys else observations
 
     def _augment_images(self, images: th.Tensor) -> th.Tensor:

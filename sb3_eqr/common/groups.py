@@ -9,6 +9,7 @@ import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import cache
 from math import prod
 
 import torch as th
@@ -133,10 +134,15 @@ def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :param angles: radians, (..., n(n-1)/2)
     :return: (..., n, n)
     """
-    upper = angles.new_zeros(*angles.shape[:-1], n, n)
-    rows, cols = th.triu_indices(n, n, offset=1, device=angles.device)
-    upper = upper.index_put((..., rows, cols), angles) if angles.numel() else upper
-    return th.matrix_exp(upper - upper.mT)
+    return th.matrix_exp(th.einsum("...d,dij->...ij", angles, _skew_basis(n, angles.dtype, angles.device)))
+
+
+@cache
+def _skew_basis(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
+    basis = th.zeros(n * (n - 1) // 2, n, n, dtype=dtype)
+    for d, (i, j) in enumerate(_planes(n)):
+        basis[d, i, j], basis[d, j, i] = 1.0, -1.0
+    return basis.to(device)
 
 
 def _planes(n: int) -> list[tuple[int, int]]:
@@ -306,9 +312,7 @@ class ProductGroup(Group):
 
     def _flatten(self, pieces) -> th.Tensor:
         groups = [group for group, _ in self.factors]
-        return th.cat(
-            [piece.flatten(-1 - len(g.element_shape)) for g, piece in zip(groups, pieces, strict=True)], dim=-1
-        )
+        return th.cat([piece.flatten(-1 - len(g.element_shape)) for g, piece in zip(groups, pieces, strict=True)], dim=-1)
 
 
 _FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")

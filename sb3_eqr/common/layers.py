@@ -1,5 +1,6 @@
 """Layers that PyTorch does not have: noisy linear layers, the paper's convolutions, the distributional head."""
 
+from itertools import pairwise
 from math import sqrt
 
 import torch as th
@@ -58,7 +59,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
         modules: list[nn.Module] = []
-        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for n_in, n_out in pairwise(sizes):
             modules += [
                 nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init),
                 activation_fn(),
@@ -137,11 +138,11 @@ class ConvTrunk(nn.Sequential):
     def __init__(self, in_channels: int):
         super().__init__(
             nn.Conv2d(in_channels, 32, kernel_size=8, stride=4),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, kernel_size=4, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(64, 64, kernel_size=3, stride=1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Flatten(),
         )
         # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU.

@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm, TDLoss
 from sb3_eqr.common.losses import quantile_huber_loss
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
-from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, MlpPolicy, MultiInputPolicy
+from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, EqRQuantileNetwork, MlpPolicy, MultiInputPolicy
 
 
 class EqRQRDQN(EqRAlgorithm, QRDQN):
@@ -75,6 +75,9 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy: EqRQRDQNPolicy  # type: ignore[assignment]
+    quantile_net: EqRQuantileNetwork
+    quantile_net_target: EqRQuantileNetwork
+    target_update_interval: int | None  # type: ignore[assignment]
 
     def __init__(
         self,

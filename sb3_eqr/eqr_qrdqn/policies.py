@@ -1,6 +1,6 @@
 """Policies of EqRQRDQN: those of ``sb3_contrib.QRDQN`` with a group encoder, a dueling noisy head and a latent model."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -90,7 +90,8 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     :param n_quantiles: number of quantiles; Table 5's support has 51
     :param net_arch: hidden sizes of the Q head; ``None``: [256] (appendix B.4)
     :param activation_fn: Activation function of the Q head
-    :param features_extractor_class: the trunk; the group encoder is put behind it
+    :param features_extractor_class: the trunk; the group encoder is put behind it. ``None``: SB3's ``FlattenExtractor``
+        (MlpPolicy), the paper's three convolutions (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: its keyword arguments
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, Adam by default
@@ -107,6 +108,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     :param latent_model_kwargs: set by the algorithm: which parts of the latent model to build; ``None`` for no latent model
     """
 
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     quantile_net: EqRQuantileNetwork
     quantile_net_target: EqRQuantileNetwork
 
@@ -118,7 +120,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         n_quantiles: int = 51,
         net_arch: list[int] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -134,9 +136,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         latent_model_kwargs: dict[str, Any] | None = None,
     ):
         net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
-        self._configure(
-            net_arch, group, n_blocks, parameterization, latent_hidden_dim, shared_projection, latent_model_kwargs
-        )
+        self._configure(net_arch, group, n_blocks, parameterization, latent_hidden_dim, shared_projection, latent_model_kwargs)
         self.dueling = dueling
         self.noisy = noisy
         self.sigma_init = sigma_init
@@ -147,7 +147,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
             n_quantiles,
             net_arch,
             activation_fn,
-            features_extractor_class,
+            features_extractor_class or self.default_trunk_class,
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
@@ -179,14 +179,10 @@ MlpPolicy = EqRQRDQNPolicy
 class CnnPolicy(EqRQRDQNPolicy):
     """:class:`EqRQRDQNPolicy` for images: the trunk is the paper's three convolutions. Same parameters."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = ConvExtractor, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_trunk_class = ConvExtractor
 
 
 class MultiInputPolicy(EqRQRDQNPolicy):
     """:class:`EqRQRDQNPolicy` for dict observations: the trunk is SB3's ``CombinedExtractor``. Same parameters."""
 
-    def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
-    ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_trunk_class = CombinedExtractor

@@ -1,0 +1,195 @@
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_eqr.common.groups import (
+    GL,
+    SO,
+    MatrixLieGroup,
+    ProductGroup,
+    T,
+    euler_rotation,
+    exp_rotation,
+    guarded_inverse,
+    make_group,
+)
+
+AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
+
+GROUPS = [
+    *[(name, "euler") for name in ("GL(1)", "GL(2)", "GL(4)", "T(1)", "T(5)", "SE(1)", "SE(2)", "SE(3)", "SE(5)")],
+    *[(name, "euler") for name in ("SO(2)", "SO(3)", "SO(6)", "SE(2)^8 x SO(3)^4", "T(2) x GL(2)^3")],
+    *[(name, "exp") for name in ("SO(2)", "SO(3)", "SO(6)", "SE(1)", "SE(2)", "SE(4)", "SE(2)^2 x SO(3)")],
+    (MatrixLieGroup(AFFINE_1D), "exp"),
+]
+IDS = [f"{name}-{parameterization}" for name, parameterization in GROUPS]
+
+
+def random_elements(group, *batch, seed=0):
+    generator = th.Generator().manual_seed(seed)
+    params = th.randn(*batch, group.num_params, generator=generator, dtype=th.float64)
+    if "GL" in group.name:  # well conditioned: shift each matrix of the GL blocks towards the identity
+        params = params + 4 * group_identity_params(group)
+    return group.element(params)
+
+
+def group_identity_params(group):
+    if isinstance(group, GL):
+        return th.eye(group.element_shape[0], dtype=th.float64).flatten()
+    factors = group.factors if isinstance(group, ProductGroup) else []
+    pieces = [
+        group_identity_params(g).repeat(n) if isinstance(g, GL) else th.zeros(n * g.num_params, dtype=th.float64)
+        for g, n in factors
+    ]
+    return th.cat(pieces)
+
+
+@pytest.mark.parametrize("name, parameterization", GROUPS, ids=IDS)
+def test_axioms(name, parameterization):
+    group = make_group(name, parameterization)
+    a, b, c = (random_elements(group, 3, 4, seed=s) for s in range(3))
+    assert a.shape == (3, 4, *group.element_shape) and a.dtype == th.float64
+    e = group.identity(3, 4, dtype=th.float64)
+    assert e.shape == a.shape
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    th.testing.assert_close(group.compose(e, a), a, **close)
+    th.testing.assert_close(group.compose(a, e), a, **close)
+    th.testing.assert_close(group.compose(a, group.inverse(a)), e, **close)
+    th.testing.assert_close(group.compose(group.inverse(a), a), e, **close)
+    scale = max(1.0, group.compose(a, group.compose(b, c)).abs().max().item())
+    associator = group.compose(group.compose(a, b), c) - group.compose(a, group.compose(b, c))
+    assert associator.abs().max().item() <= 1e-12 * scale
+
+
+@pytest.mark.parametrize("name, parameterization", GROUPS, ids=IDS)
+def test_gradients(name, parameterization):
+    group = make_group(name, parameterization)
+    params = [random_params(group, seed) for seed in (0, 1)]
+
+    def function(p, q):
+        return group.compose(group.element(p), group.inverse(group.element(q)))
+
+    assert th.autograd.gradcheck(function, params)
+
+
+def random_params(group, seed):
+    params = th.randn(2, group.num_params, generator=th.Generator().manual_seed(seed), dtype=th.float64)
+    if "GL" in group.name:
+        params = params + 4 * group_identity_params(group)
+    return params.requires_grad_()
+
+
+@pytest.mark.parametrize("n", [2, 3, 6])
+@pytest.mark.parametrize("kind", ["SO", "SE"])
+@pytest.mark.parametrize("parameterization", ["euler", "exp"])
+def test_rotations_are_rotations(n, kind, parameterization):
+    rotation = random_elements(make_group(f"{kind}({n})", parameterization), 7)[..., :n, :n]
+    eye = th.eye(n, dtype=th.float64).expand(7, n, n)
+    th.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-12)
+    th.testing.assert_close(th.linalg.det(rotation), th.ones(7, dtype=th.float64), rtol=0, atol=1e-12)
+
+
+def test_euler_and_exp_agree_on_so2():
+    angles = th.linspace(-7, 7, 41, dtype=th.float64)[:, None]
+    th.testing.assert_close(euler_rotation(angles, 2), exp_rotation(angles, 2), rtol=0, atol=1e-12)
+
+
+def test_euler_is_the_product_over_planes_worked_out_by_hand():
+    a, b, c = 0.3, -1.1, 2.0  # planes (0, 1), (0, 2), (1, 2)
+    r01 = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    r02 = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    r12 = np.array([[1, 0, 0], [0, np.cos(c), np.sin(c)], [0, -np.sin(c), np.cos(c)]])
+    found = SO(3).element(th.tensor([a, b, c], dtype=th.float64))
+    np.testing.assert_allclose(found.numpy(), r01 @ r02 @ r12, atol=1e-15)
+
+
+def test_se2_element_and_inverse_by_hand():
+    group = make_group("SE(2)")
+    element = group.element(th.tensor([np.pi / 2, 3.0, 4.0], dtype=th.float64))  # angle first
+    th.testing.assert_close(element, th.tensor([[0.0, 1, 3], [-1, 0, 4], [0, 0, 1]], dtype=th.float64))
+    th.testing.assert_close(group.inverse(element), th.tensor([[0.0, -1, 4], [1, 0, -3], [0, 0, 1]], dtype=th.float64))
+
+
+@pytest.mark.parametrize("n", range(1, 7))
+def test_parameter_counts_of_table_1(n):
+    assert make_group(f"GL({n})").num_params == n**2
+    assert make_group(f"SE({n})").num_params == n * (n - 1) // 2 + n
+    assert make_group(f"T({n})").num_params == n
+    if n >= 2:
+        assert make_group(f"SO({n})").num_params == n * (n - 1) // 2
+
+
+def test_element_shapes():
+    assert make_group("GL(3)").element_shape == (3, 3)
+    assert make_group("SE(3)").element_shape == (4, 4)
+    assert make_group("T(3)").element_shape == (3,)
+    product = make_group("SE(2)^8 x SO(3)^4")
+    assert product.num_params == 8 * 3 + 4 * 3
+    assert product.element_shape == (8 * 9 + 4 * 9,)
+
+
+def test_product_is_its_factors_side_by_side():
+    product, se2, so3 = make_group("SE(2)^2 x SO(3)"), make_group("SE(2)"), make_group("SO(3)")
+    p, q = th.randn(2, 5, 9, generator=th.Generator().manual_seed(0), dtype=th.float64)
+
+    def pieces(params):
+        first, second = params[:, :6].reshape(5, 2, 3), params[:, 6:]
+        return se2.element(first), so3.element(second)
+
+    (a, b), (c, d) = pieces(p), pieces(q)
+    expected = th.cat([(a @ c).flatten(1), (b @ d).flatten(1)], dim=1)
+    found = product.compose(product.element(p), product.element(q))
+    th.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+
+
+def test_generators_of_so2_give_so2():
+    group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]]])
+    angles = th.linspace(-3, 3, 11, dtype=th.float64)[:, None]
+    th.testing.assert_close(group.element(angles), make_group("SO(2)").element(angles), rtol=0, atol=1e-12)
+
+
+def test_no_group_lets_the_transition_predict_the_next_state():
+    group = make_group("none(4)")
+    left, right = th.randn(2, 3, 4)
+    assert th.equal(group.compose(left, right), left)
+    with pytest.raises(ValueError, match="get_coef=0"):
+        group.inverse(left)
+
+
+@pytest.mark.parametrize("matrix", [th.zeros(2, 2), th.ones(3, 3), th.full((2, 2), 1e-30), th.diag(th.tensor([1.0, 1e-12]))])
+def test_singular_matrices_neither_stop_nor_poison(matrix):
+    good = th.eye(len(matrix)) * 2
+    batch = th.stack([matrix, good]).requires_grad_()
+    inverse = guarded_inverse(batch)
+    assert th.isfinite(inverse).all()
+    assert th.equal(inverse[1], good / 4)
+    inverse.sum().backward()
+    assert th.isfinite(batch.grad).all()
+    assert inverse.abs().max() < 1e6
+
+
+def test_damped_inverse_is_nearly_the_pseudo_inverse():
+    matrix = th.diag(th.tensor([2.0, 0.0], dtype=th.float64))
+    th.testing.assert_close(guarded_inverse(matrix), th.linalg.pinv(matrix), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "name", ["SU(2)", "SE", "SE(0)", "SO(1)", "T(-1)", "GL(2.5)", "SE(2)^0", "SE(2) x ", "", "gl(2)", "SE(2)^8 + SO(3)"]
+)
+def test_bad_names_are_refused_with_the_legal_ones(name):
+    with pytest.raises(ValueError, match=r"GL\(n\), SE\(n\), T\(n\)") as error:
+        make_group(name)
+    assert repr(name) in str(error.value)
+
+
+def test_bad_parameterization_and_generators():
+    with pytest.raises(ValueError, match="euler"):
+        make_group("SO(3)", parameterization="quaternion")
+    for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]]):
+        with pytest.raises(ValueError, match=r"\(D, m, m\)"):
+            MatrixLieGroup(generators)
+
+
+def test_a_group_passes_through():
+    group = T(3)
+    assert make_group(group) is group

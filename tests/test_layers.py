@@ -1,0 +1,100 @@
+import torch as th
+from torch import nn
+
+from sb3_eqr.common.augmentations import random_intensity, random_shift
+from sb3_eqr.common.layers import ConvTrunk, DistributionalHead, NoisyLinear
+
+
+def test_noise_is_factorised_and_fresh():
+    th.manual_seed(0)
+    layer = NoisyLinear(6, 5, sigma_init=0.5)
+    eye = th.eye(6)  # rows of weights: W e_k + b
+    clean = layer(eye)
+    assert th.equal(clean, nn.functional.linear(eye, layer.weight, layer.bias))
+    assert th.equal(clean, layer(eye))
+    zero = th.zeros(1, 6)
+    draws = []
+    for _ in range(3):
+        state = th.get_rng_state()
+        noisy = layer(eye, noisy=True) - clean
+        th.set_rng_state(state)
+        bias_noise = layer(zero, noisy=True) - layer(zero)  # the same draw: what the bias alone gets
+        weight_noise = (noisy - bias_noise).T / layer.weight_sigma  # f(ε_out) f(ε_in)ᵀ
+        singular = th.linalg.svdvals(weight_noise)
+        assert singular[1] < 1e-5 * singular[0]
+        draws.append(noisy)
+    assert not th.allclose(draws[0], draws[1]) and not th.allclose(draws[1], draws[2])
+
+
+def test_noise_does_not_depend_on_train_mode():
+    layer = NoisyLinear(4, 4).eval()
+    inputs = th.randn(2, 4)
+    assert not th.equal(layer(inputs, noisy=True), layer(inputs, noisy=True))
+    layer.train()
+    assert th.equal(layer(inputs), layer(inputs))
+
+
+def test_noisy_initialisation_is_that_of_the_paper():
+    layer = NoisyLinear(16, 1000, sigma_init=0.5)
+    assert layer.weight.abs().max() <= 0.25 and layer.bias.abs().max() <= 0.25  # 1 / sqrt(16)
+    assert layer.weight.std() > 0.13  # of U(-0.25, 0.25): 0.144
+    assert (layer.weight_sigma == 0.125).all() and (layer.bias_sigma == 0.125).all()
+
+
+def test_dueling_by_hand():
+    head = DistributionalHead(2, 3, 4, [8], nn.ReLU, dueling=True, sigma_init=None)
+    features = th.randn(5, 2)
+    value = head.value(features)  # (5, 4)
+    advantage = head.advantage(features).view(5, 4, 3)
+    found = head(features)
+    for action in range(3):
+        expected = value + advantage[:, :, action] - (advantage[:, :, 0] + advantage[:, :, 1] + advantage[:, :, 2]) / 3
+        th.testing.assert_close(found[:, :, action], expected)
+
+
+def test_projection_is_the_first_layer_without_noise():
+    head = DistributionalHead(2, 3, 4, [8], nn.ReLU, dueling=True, sigma_init=0.5)
+    features = th.randn(5, 6, 2)
+    expected = th.cat([nn.functional.linear(features, s[0].weight, s[0].bias) for s in (head.value, head.advantage)], -1)
+    assert th.equal(head.project(features), expected)
+    assert head.project(features).shape == (5, 6, 16)
+
+
+def test_conv_trunk_is_the_network_of_2015():
+    trunk = ConvTrunk(4)
+    assert sum(p.numel() for p in trunk.parameters()) == 4 * 32 * 64 + 32 + 32 * 64 * 16 + 64 + 64 * 64 * 9 + 64
+    images = th.rand(2, 4, 84, 84)
+    assert trunk(images).shape == (2, 3136)
+    reference = nn.Sequential(nn.Conv2d(4, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU())
+    reference.extend([nn.Conv2d(64, 64, 3), nn.ReLU(), nn.Flatten()]).load_state_dict(trunk.state_dict())
+    th.testing.assert_close(trunk(images), reference(images), rtol=1e-4, atol=1e-5)
+
+
+def test_shift_is_a_crop_of_the_edge_padded_image():
+    th.manual_seed(0)
+    images = th.randint(0, 256, (40, 2, 9, 7), dtype=th.uint8)
+    shifted = random_shift(images, pad=2)
+    assert shifted.dtype == th.uint8 and shifted.shape == images.shape
+    padded = nn.functional.pad(images.float(), (2, 2, 2, 2), mode="replicate").to(th.uint8)
+    offsets = set()
+    for before, after in zip(padded, shifted, strict=True):
+        crops = {(y, x): before[:, y : y + 9, x : x + 7] for y in range(5) for x in range(5)}
+        fitting = [offset for offset, crop in crops.items() if th.equal(crop, after)]
+        assert len(fitting) == 1  # both channels moved alike, by a whole number of pixels
+        offsets.update(fitting)
+    assert len(offsets) > 15  # of 25: images move each on its own
+    assert th.equal(random_shift(images, pad=0), images)
+
+
+def test_intensity_scales_each_image_by_one_number():
+    th.manual_seed(0)
+    images = th.randint(1, 256, (200, 2, 6, 5), dtype=th.uint8)
+    scaled = random_intensity(images, scale=0.05)
+    assert scaled.dtype == th.float32
+    ratios = (scaled / images).flatten(1)
+    th.testing.assert_close(ratios, ratios[:, :1].expand_as(ratios))
+    noise = (ratios[:, 0] - 1) / 0.05
+    assert noise.abs().max() <= 2.0 + 1e-4 and 0.7 < noise.std() < 1.1  # a clipped normal has 0.88
+    before = images.float()
+    random_intensity(before, scale=0.5)
+    assert th.equal(before, images.float())  # the caller's images stay
