@@ -110,7 +110,7 @@ class FrameStore:
     def _take_slots(self, count: int) -> np.ndarray:
         reused = min(count, self._n_free)
         self._n_free -= reused
-        slots = self._free[self._n_free : self._n_free + reused]
+        slots = self._free[self._n_free : self._n_free + reused].copy()  # growing moves the array
         fresh = np.arange(self._n_used, self._n_used + count - reused, dtype=np.int32)
         self._n_used += count - reused
         if self._n_used > len(self._frames):

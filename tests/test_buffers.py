@@ -1,0 +1,425 @@
+import pickle
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+
+ACTIONS = spaces.Discrete(4)
+VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+IMAGES = spaces.Box(0, 255, (4, 6, 5), np.uint8)
+BOTH = pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
+
+
+class Stream:
+    """Random episodes in several environments, remembered whole: what the plainest buffer would hold."""
+
+    def __init__(self, space, n_envs, seed=0, padding="zero", mean_length=6, channels=1):
+        self.space, self.n_envs, self.padding, self.mean_length = space, n_envs, padding, mean_length
+        self.channels = channels  # of one frame
+        self.rng = np.random.default_rng(seed)
+        self.steps = []  # one dict of arrays per call of add
+        self.obs = np.stack([self.first() for _ in range(n_envs)])
+
+    def frame(self):
+        if self.space is IMAGES:
+            return self.rng.integers(0, 256, (self.channels, 6, 5), dtype=np.uint8)
+        return self.rng.normal(size=3).astype(np.float32)
+
+    def first(self):
+        if self.space is not IMAGES:
+            return self.frame()
+        frame = self.frame()
+        padding = {"zero": np.zeros_like(frame), "repeat": frame, "other": self.frame()}[self.padding]
+        return np.concatenate([padding] * (4 // self.channels - 1) + [frame])
+
+    def following(self, obs):
+        return np.concatenate([obs[self.channels :], self.frame()]) if self.space is IMAGES else self.frame()
+
+    def feed(self, n_steps, *buffers):
+        for _ in range(n_steps):
+            next_obs = np.stack([self.following(obs) for obs in self.obs])
+            done = self.rng.random(self.n_envs) < 1 / self.mean_length
+            timeout = done & (self.rng.random(self.n_envs) < 0.5)
+            step = {
+                "obs": self.obs,
+                "next_obs": next_obs,
+                "action": self.rng.integers(0, 4, self.n_envs),
+                "reward": self.rng.normal(size=self.n_envs).astype(np.float32),
+                "done": done,
+                "infos": [{"TimeLimit.truncated": bool(t)} for t in timeout],
+            }
+            for buffer in buffers:
+                buffer.add(**step)
+            self.steps.append({**step, "timeout": timeout})
+            self.obs = np.stack([self.first() if d else o for d, o in zip(done, next_obs, strict=True)])
+
+    def window(self, position, env, size, n, depth, gamma):
+        """The window that starts at a position of the ring, by loops in float64, or None if it crosses the head."""
+        start = max(k for k in range(position, len(self.steps), size))
+        taken = []
+        for k in range(start, start + max(n, depth)):
+            if k == len(self.steps):
+                return None
+            taken.append(self.steps[k])
+            if taken[-1]["done"][env]:
+                break
+        steps = taken[:n]
+        expected = {
+            "observations": taken[0]["obs"][env],
+            "actions": [taken[0]["action"][env]],
+            "next_observations": steps[-1]["next_obs"][env],
+            "dones": [float(steps[-1]["done"][env] and not steps[-1]["timeout"][env])],
+            "rewards": [sum(gamma**k * float(s["reward"][env]) for k, s in enumerate(steps))],
+            "discounts": [gamma ** len(steps)],
+        }
+        if depth:
+            padded = taken[:depth] + [taken[-1]] * (depth - len(taken))
+            expected["mask"] = [1.0] * len(taken[:depth]) + [0.0] * (depth - len(taken))
+            expected["rollout_observations"] = np.stack([s["next_obs"][env] for s in padded])
+            expected["rollout_actions"] = [s["action"][env] for s in padded]
+            expected["rollout_rewards"] = [float(s["reward"][env]) * m for s, m in zip(padded, expected["mask"], strict=True)]
+        return expected
+
+
+@pytest.mark.parametrize("n_steps", [1, 3, 7])
+@pytest.mark.parametrize("n_envs, n_adds", [(1, 30), (1, 97), (3, 97)])
+def test_without_rollout_it_is_sb3s_n_step_buffer(n_steps, n_envs, n_adds):
+    """Field by field and draw by draw, before and after wrap-around, with time-outs."""
+    stream = Stream(VECTOR, n_envs)
+    theirs = NStepReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
+    ours = SequenceReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
+    stream.feed(n_adds, theirs, ours)
+    for seed in range(20):
+        np.random.seed(seed)
+        expected = theirs.sample(64)
+        np.random.seed(seed)
+        found = ours.sample(64)
+        for field in expected._fields:
+            assert th.equal(getattr(found, field), getattr(expected, field)), field
+            assert getattr(found, field).dtype == getattr(expected, field).dtype
+    assert th.equal(found.weights, th.ones(64)) and found.mask is None
+
+
+def test_one_step_without_rollout_is_sb3s_plain_buffer():
+    stream = Stream(IMAGES, 2)
+    theirs = ReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2)
+    ours = SequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2, frame_stack=4)
+    stream.feed(57, theirs, ours)
+    np.random.seed(0)
+    expected = theirs.sample(500)
+    np.random.seed(0)
+    found = ours.sample(500)
+    for field in ("observations", "actions", "next_observations", "dones", "rewards"):
+        assert th.equal(getattr(found, field), getattr(expected, field)), field
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "space, frame_stack, padding",
+    [
+        (VECTOR, 1, ""),
+        (IMAGES, 1, "zero"),
+        (IMAGES, 4, "zero"),
+        (IMAGES, 4, "repeat"),
+        (IMAGES, 4, "other"),
+        (IMAGES, 2, "zero"),
+    ],
+)
+@pytest.mark.parametrize("n_steps, depth", [(3, 5), (6, 2), (1, 1)])
+@pytest.mark.parametrize("n_envs, n_adds", [(1, 25), (3, 101)])
+def test_every_sample_is_what_was_put_in(buffer_class, space, frame_stack, padding, n_steps, depth, n_envs, n_adds):
+    stream = Stream(space, n_envs, padding=padding, mean_length=5, channels=4 // frame_stack)
+    buffer = buffer_class(
+        30 * n_envs,
+        space,
+        ACTIONS,
+        "cpu",
+        n_envs,
+        n_steps=n_steps,
+        prediction_depth=depth,
+        gamma=0.9,
+        frame_stack=frame_stack,
+    )
+    stream.feed(n_adds, buffer)
+    np.random.seed(0)
+    samples = buffer.sample(800)
+    seen = set()
+    for b, index in enumerate(samples.indices):
+        position, env = divmod(int(index), n_envs)
+        expected = stream.window(position, env, 30, n_steps, depth, 0.9)
+        assert expected is not None, "a window crosses the write head"
+        for field, value in expected.items():
+            found = getattr(samples, field)[b].numpy()
+            if field in ("rewards", "discounts"):
+                np.testing.assert_allclose(found, value, rtol=1e-5, atol=1e-6)
+            else:
+                assert np.array_equal(found, np.asarray(value, dtype=found.dtype)), field
+        seen.add(int(index))
+    assert len(seen) == (min(n_adds, 30) - max(n_steps, depth) + 1) * n_envs  # every legal start, and no other
+
+
+def test_axes_and_mask_by_hand():
+    """Observation 10·b + t of environment b at step t: what an axis read the wrong way round would mix up."""
+    space = spaces.Box(0, 255, (1,), np.float32)
+    n_envs, depth, lengths = 4, 3, [2, 1, 5, 3]
+    buffer = SequenceReplayBuffer(100, space, ACTIONS, "cpu", n_envs, n_steps=2, prediction_depth=depth, gamma=0.5)
+    for t in range(6):
+        obs = np.array([[10 * b + t] for b in range(n_envs)], dtype=np.float32)
+        done = np.array([t + 1 == length for length in lengths])
+        action = np.array([(b + t) % 4 for b in range(n_envs)])
+        buffer.add(obs, obs + 1, action, 100 * np.arange(n_envs) + t, done, [{}] * n_envs)
+    np.random.seed(0)
+    samples = buffer.sample(500)
+    rows = [int(np.flatnonzero(samples.indices == b)[0]) for b in range(n_envs)]  # the windows that start at t = 0
+    assert samples.mask[rows].tolist() == [[1, 1, 0], [1, 0, 0], [1, 1, 1], [1, 1, 1]]
+    assert samples.rollout_observations[rows, :, 0].tolist() == [[1, 2, 2], [11, 11, 11], [21, 22, 23], [31, 32, 33]]
+    assert samples.rollout_rewards[rows].tolist() == [[0, 1, 0], [100, 0, 0], [200, 201, 202], [300, 301, 302]]
+    assert samples.rollout_actions[rows].tolist() == [[0, 1, 1], [1, 1, 1], [2, 3, 0], [3, 0, 1]]
+    assert samples.next_observations[rows, 0].tolist() == [2, 11, 22, 32]
+    assert samples.rewards[rows, 0].tolist() == [0.5, 100, 300.5, 450.5]
+    assert samples.discounts[rows, 0].tolist() == [0.25, 0.5, 0.25, 0.25]
+    assert samples.dones[rows, 0].tolist() == [1, 1, 0, 0]
+
+
+def test_nothing_is_drawn_before_the_first_window_is_whole():
+    stream = Stream(VECTOR, 2, mean_length=1000)
+    buffer = SequenceReplayBuffer(60, VECTOR, ACTIONS, "cpu", 2, n_steps=4, prediction_depth=2)
+    stream.feed(3, buffer)
+    assert not buffer.can_sample()
+    stream.feed(1, buffer)
+    assert buffer.can_sample() and set(buffer.sample(50).indices) == {0, 1}
+
+
+@BOTH
+def test_n_and_gamma_are_read_at_sampling_time(buffer_class):
+    stream = Stream(VECTOR, 1, mean_length=1000)
+    buffer = buffer_class(50, VECTOR, ACTIONS, "cpu", 1, n_steps=10, prediction_depth=2, gamma=0.9)
+    stream.feed(70, buffer)
+    for n_steps, gamma in [(10, 0.9), (3, 0.97), (8, 0.5), (12, 0.9), (1, 0.0)]:
+        buffer.n_steps, buffer.gamma = n_steps, gamma
+        samples = buffer.sample(4000)
+        for b in range(0, 4000, 100):
+            expected = stream.window(int(samples.indices[b]), 0, 50, n_steps, 2, gamma)
+            assert expected is not None
+            np.testing.assert_allclose(samples.rewards[b], expected["rewards"], rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(samples.discounts[b], expected["discounts"], rtol=1e-6)
+        # The ring's newest is at 19: the starts are the positions of age max(n, M) - 1 and above.
+        assert len(set(samples.indices)) == 50 - max(n_steps, 2) + 1
+
+
+def test_a_reset_in_the_middle_of_an_episode_ends_its_windows():
+    """``learn`` called a second time resets the environment without telling the buffer."""
+    stream = Stream(VECTOR, 2, mean_length=10**9)
+    buffer = SequenceReplayBuffer(60, VECTOR, ACTIONS, "cpu", 2, n_steps=3, prediction_depth=3)
+    stream.feed(5, buffer)
+    stream.obs = np.stack([stream.first(), stream.obs[1]])  # environment 0 only
+    stream.feed(5, buffer)
+    samples = buffer.sample(500)
+    row = {int(index): b for b, index in enumerate(samples.indices)}
+    assert samples.mask[row[4 * 2 + 0]].tolist() == [1, 0, 0]
+    assert samples.mask[row[4 * 2 + 1]].tolist() == [1, 1, 1]
+    assert samples.dones.sum() == 0
+    assert np.array_equal(samples.next_observations[row[3 * 2]].numpy(), stream.steps[4]["next_obs"][0])
+
+
+def test_dict_and_discrete_observations():
+    space = spaces.Dict({"image": IMAGES, "vector": VECTOR, "number": spaces.Discrete(7)})
+    buffer = SequenceReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=2, prediction_depth=2)
+    rng = np.random.default_rng(0)
+    made = [
+        {
+            "image": rng.integers(0, 256, (2, 4, 6, 5), dtype=np.uint8),
+            "vector": rng.normal(size=(2, 3)).astype(np.float32),
+            "number": rng.integers(0, 7, 2),
+        }
+        for _ in range(12)
+    ]
+    for now, then in zip(made[:-1], made[1:], strict=True):
+        buffer.add(now, then, np.array([0, 1]), np.zeros(2), np.zeros(2, dtype=bool), [{}, {}])
+    samples = buffer.sample(100)
+    for b, index in enumerate(samples.indices):
+        t, env = divmod(int(index), 2)
+        for key in space.spaces:
+            expected = np.stack([made[t + m][key][env] for m in (1, 2)]).reshape(2, *buffer.obs_shape[key])
+            assert np.array_equal(samples.rollout_observations[key][b].numpy(), expected)
+            assert np.array_equal(samples.next_observations[key][b].numpy(), expected[1])
+
+
+def test_vec_normalize_acts_on_every_observation_and_on_one_step_rewards():
+    class Halve(VecNormalize):
+        def __init__(self):  # only these two are used
+            pass
+
+        def normalize_obs(self, obs):
+            return obs / 2
+
+        def normalize_reward(self, reward):
+            return np.clip(reward, -0.5, 0.5)
+
+    stream = Stream(VECTOR, 1)
+    buffer = SequenceReplayBuffer(50, VECTOR, ACTIONS, "cpu", 1, n_steps=3, prediction_depth=2, gamma=0.9)
+    stream.feed(40, buffer)
+    np.random.seed(0)
+    raw = buffer.sample(30)
+    np.random.seed(0)
+    found = buffer.sample(30, env=Halve())
+    for field in ("observations", "next_observations", "rollout_observations"):
+        assert th.equal(getattr(found, field), getattr(raw, field) / 2)
+    assert th.equal(found.rollout_rewards, raw.rollout_rewards.clamp(-0.5, 0.5))
+    start = int(raw.indices[0])
+    rewards = []
+    for step in stream.steps[start : start + 3]:
+        rewards.append(float(np.clip(step["reward"][0], -0.5, 0.5)))
+        if step["done"][0]:
+            break
+    expected = sum(0.9**k * r for k, r in enumerate(rewards))
+    assert found.rewards[0, 0].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_memory_per_transition_at_atari_size():
+    space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    buffer = PrioritizedSequenceReplayBuffer(2_000, space, ACTIONS, "cpu", n_steps=10, prediction_depth=5, frame_stack=4)
+    frames = np.random.default_rng(0).integers(0, 256, (50, 84, 84), dtype=np.uint8)
+    stack = np.zeros((1, 4, 84, 84), dtype=np.uint8)
+    for t in range(4_500):  # wraps twice; an episode every 40 steps, far shorter than a life in Atari
+        following = np.concatenate([stack[:, 1:], frames[None, None, t % 50]], axis=1)
+        done = t % 40 == 39
+        buffer.add(stack, following, np.zeros(1), np.zeros(1), np.array([done]), [{}])
+        stack = np.zeros_like(stack) if done else following
+    assert buffer.nbytes / 2_000 <= 8_500
+    stock = ReplayBuffer(10, space, ACTIONS, "cpu")
+    assert (stock.observations.nbytes + stock.next_observations.nbytes) / 10 > 56_000
+
+
+def test_memory_does_not_grow_once_the_ring_is_full():
+    stream = Stream(IMAGES, 2, mean_length=4)
+    buffer = SequenceReplayBuffer(60, IMAGES, ACTIONS, "cpu", 2, frame_stack=4)
+    stream.feed(90, buffer)
+    before = buffer.nbytes
+    stream.feed(900, buffer)
+    assert buffer.nbytes <= before * 1.15
+
+
+@pytest.mark.parametrize("n_adds", [7, 95])
+def test_saved_and_loaded_it_goes_on_the_same(n_adds):
+    stream = Stream(IMAGES, 2, mean_length=3)
+    buffer = PrioritizedSequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2, n_steps=2, prediction_depth=3, frame_stack=4)
+    stream.feed(n_adds, buffer)
+    buffer.update_priorities(buffer.sample(10).indices, th.rand(10))
+    copy = pickle.loads(pickle.dumps(buffer))
+    stream.feed(50, buffer, copy)
+    for seed in range(3):
+        np.random.seed(seed)
+        a = buffer.sample(100)
+        np.random.seed(seed)
+        b = copy.sample(100)
+        assert np.array_equal(a.indices, b.indices)
+        for field in a._fields:
+            if field != "indices":
+                assert th.equal(getattr(a, field), getattr(b, field)), field
+
+
+def test_a_buffer_filled_to_a_tenth_makes_a_small_file():
+    space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    buffer = SequenceReplayBuffer(2_000, space, ACTIONS, "cpu", frame_stack=4)
+    stack = np.zeros((1, 4, 84, 84), dtype=np.uint8)
+    for _ in range(20):
+        buffer.add(stack, stack, np.zeros(1), np.zeros(1), np.zeros(1, dtype=bool), [{}])
+    assert len(pickle.dumps(buffer)) < 400_000
+
+
+class TestPriorities:
+    def make(self, n_adds=60, alpha=0.5, beta=0.4, n_envs=2):
+        stream = Stream(VECTOR, n_envs)
+        buffer = PrioritizedSequenceReplayBuffer(
+            20 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=3, prediction_depth=2, alpha=alpha, beta=beta
+        )
+        stream.feed(n_adds, buffer)
+        return stream, buffer
+
+    def test_draws_and_weights_by_hand(self):
+        _, buffer = self.make()
+        starts = np.unique(buffer.sample(1000).indices)
+        assert len(starts) == 36
+        priorities = np.arange(1.0, 37.0) ** 2
+        buffer.update_priorities(starts, th.tensor(priorities))
+        np.random.seed(0)
+        samples = buffer.sample(36_000)
+        expected = np.arange(1.0, 37.0) / (36 * 37 / 2)  # P ∝ p^0.5
+        counts = np.array([(samples.indices == s).sum() for s in starts])
+        np.testing.assert_allclose(counts / 36_000, expected, atol=2 / 36_000)  # stratified: nearly exact
+        weights = (36 * expected) ** -0.4
+        weights /= weights.max()
+        for start, weight in zip(starts, weights, strict=True):
+            found = samples.weights[samples.indices == start]
+            np.testing.assert_allclose(found, weight, rtol=1e-5)
+
+    def test_alpha_zero_is_uniform_and_beta_zero_has_no_weights(self):
+        _, buffer = self.make(alpha=0.0, beta=0.0)
+        starts = np.unique(buffer.sample(1000).indices)
+        buffer.update_priorities(starts, th.rand(36) * 100)
+        samples = buffer.sample(3600)
+        assert th.equal(samples.weights, th.ones(3600))
+        assert np.bincount(samples.indices)[starts].min() >= 98
+
+    def test_new_transitions_enter_at_the_largest_priority(self):
+        stream, buffer = self.make()
+        starts = np.unique(buffer.sample(1000).indices)
+        buffer.update_priorities(starts, th.full((36,), 1e-4))
+        buffer.update_priorities(starts[:1], th.tensor([9.0]))
+        buffer.update_priorities(starts[:1], th.tensor([1e-4]))
+        stream.feed(1, buffer)
+        new = set(buffer.sample(2000).indices) - set(starts)
+        samples = buffer.sample(10_000)
+        assert len(new) == 2  # the starts whose window has just become whole
+        share = np.isin(samples.indices, list(new)).mean()
+        assert share == pytest.approx(6 / (6 + 34 * (1e-4 + 1e-6) ** 0.5), abs=0.01)
+
+    def test_priorities_that_are_not_finite_are_passed_over(self):
+        _, buffer = self.make()
+        starts = np.unique(buffer.sample(1000).indices)
+        buffer.update_priorities(starts[:3], th.tensor([float("nan"), float("inf"), 0.0]))
+        samples = buffer.sample(5000)
+        assert th.isfinite(samples.weights).all()
+        assert (samples.indices == starts[0]).any()
+
+    def test_what_is_overwritten_loses_its_priority(self):
+        stream, buffer = self.make()
+        starts = np.unique(buffer.sample(1000).indices)
+        buffer.update_priorities(starts, th.full((36,), 1e6))
+        stream.feed(20, buffer)  # everything anew
+        samples = buffer.sample(2000)
+        for index in np.unique(samples.indices):
+            position, env = divmod(int(index), 2)
+            assert stream.window(position, env, 20, 3, 2, 0.99) is not None
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"buffer_size": 8}, "n_steps \\+ prediction_depth \\+ 1 = 9"),
+        ({"n_steps": 0}, "n_steps: expected at least 1, found 0"),
+        ({"prediction_depth": -1}, "prediction_depth: expected at least 0, found -1"),
+        ({"gamma": 1.5}, "gamma"),
+        ({"frame_stack": 3}, "frame_stack: expected a divisor"),
+        ({"frame_stack": 0}, "frame_stack: expected a divisor"),
+        ({"alpha": -0.1}, "alpha"),
+        ({"beta": 2.0}, "beta"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(kwargs, message):
+    arguments = {"buffer_size": 100, "n_steps": 3, "prediction_depth": 5, **kwargs}
+    with pytest.raises(ValueError, match=message):
+        PrioritizedSequenceReplayBuffer(observation_space=IMAGES, action_space=ACTIONS, device="cpu", **arguments)
+
+
+def test_a_frame_stack_that_is_not_one_is_refused_at_the_first_step():
+    buffer = SequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", frame_stack=4)
+    obs = np.random.default_rng(0).integers(0, 256, (2, 1, 4, 6, 5), dtype=np.uint8)
+    with pytest.raises(ValueError, match='"frame_stack": 1'):
+        buffer.add(obs[0], obs[1], np.zeros(1), np.zeros(1), np.zeros(1, dtype=bool), [{}])
