@@ -1,0 +1,111 @@
+"""The relations of the design that hold to the last bit."""
+
+import pytest
+import torch as th
+from sb3_contrib import QRDQN
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
+
+from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
+from sb3_eqr.common.features_extractor import ConvExtractor
+from tests.toys import ChainEnv, ImageEnv
+
+OFF = {
+    "aet_coef": 0.0,
+    "get_coef": 0.0,
+    "reward_coef": 0.0,
+    "double_q": False,
+    "prioritized_replay": False,
+    "shift_pixels": 0,
+    "intensity_scale": 0.0,
+}
+SHARED = {
+    "learning_rate": 1e-3,
+    "buffer_size": 300,
+    "learning_starts": 40,
+    "batch_size": 32,
+    "gamma": 0.98,
+    "train_freq": 4,
+    "gradient_steps": 2,
+    "target_update_interval": 50,
+    "exploration_fraction": 0.5,
+    "exploration_final_eps": 0.1,
+    "n_steps": 1,
+    "max_grad_norm": None,
+    "seed": 3,
+    "device": "cpu",
+}
+NETWORK = {"n_quantiles": 20, "net_arch": [32], "optimizer_class": th.optim.Adam, "optimizer_kwargs": {"eps": 1e-4}}
+
+
+def assert_same_networks(ours, theirs):
+    assert ours._n_updates == theirs._n_updates > 0
+    for name in ("quantile_net", "quantile_net_target"):
+        ours_all = list(getattr(ours, name).parameters())
+        theirs_all = list(getattr(theirs, name).parameters())
+        assert len(ours_all) == len(theirs_all) > 0
+        for a, b in zip(ours_all, theirs_all, strict=True):
+            assert th.equal(a, b)
+
+
+@pytest.mark.parametrize("n_envs, n_steps, max_grad_norm, tau", [(1, 1, None, 1.0), (1, 3, 10.0, 1.0), (3, 5, 0.5, 0.3)])
+def test_with_every_switch_off_it_is_qrdqn(n_envs, n_steps, max_grad_norm, tau):
+    extra = {"n_steps": n_steps, "max_grad_norm": max_grad_norm, "tau": tau}
+    env = [make_vec_env(ChainEnv, n_envs) for _ in range(2)]
+    theirs = QRDQN("MlpPolicy", env[0], policy_kwargs=dict(NETWORK), **{**SHARED, **extra}).learn(700)
+    off = {"group": None, "features_extractor_class": FlattenExtractor, "dueling": False, "noisy": False}
+    ours = EqRQRDQN("MlpPolicy", env[1], policy_kwargs={**NETWORK, **off}, **{**SHARED, **OFF, **extra}).learn(700)
+    assert_same_networks(ours, theirs)
+
+
+@pytest.mark.parametrize("extractor", [NatureCNN, ConvExtractor])
+def test_on_images_too(extractor):
+    shared = {**SHARED, "learning_starts": 40, "train_freq": 8, "gradient_steps": 1}
+    trunk = {"features_extractor_class": extractor}
+    theirs = QRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk}, **shared).learn(120)
+    off = {"group": None, "dueling": False, "noisy": False}
+    ours = EqRQRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk, **off}, **shared, **OFF).learn(120)
+    assert_same_networks(ours, theirs)
+
+
+def test_the_group_encoder_is_a_plain_features_extractor():
+    """The same encoder in stock QRDQN and in ours."""
+    encoder = {"group": "SE(2)", "n_blocks": 3}
+    theirs_kwargs = {**NETWORK, "features_extractor_class": GroupFeaturesExtractor, "features_extractor_kwargs": encoder}
+    theirs = QRDQN("MlpPolicy", ChainEnv(), policy_kwargs=theirs_kwargs, **SHARED).learn(400)
+    ours_kwargs = {**NETWORK, **encoder, "dueling": False, "noisy": False}
+    ours = EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs=ours_kwargs, **SHARED, **OFF).learn(400)
+    assert_same_networks(ours, theirs)
+
+
+@pytest.mark.parametrize("switched_off", ["aet_coef", "get_coef", "reward_coef", "prediction_depth"])
+def test_each_switch_does_something(switched_off):
+    """The relation above says nothing if the switches are not wired."""
+    settings = {**SHARED, "n_steps": 3, "prediction_depth": 2, "target_update_interval": None}
+    full = EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(150)
+    less = EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, switched_off: 0}).learn(150)
+    assert any(not th.equal(a, b) for a, b in zip(full.quantile_net.parameters(), less.quantile_net.parameters(), strict=True))
+
+
+def same_state(a, b):
+    first, second = a.policy.state_dict(), b.policy.state_dict()
+    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
+
+
+def test_same_seed_twice_other_seed_once():
+    settings = {**SHARED, "n_steps": 3, "target_update_interval": None}
+    a, b, c = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, "seed": s}).learn(200) for s in (1, 1, 2))
+    assert same_state(a, b)
+    assert not same_state(a, c)
+
+
+def test_sharing_the_target_pass_changes_no_number():
+    """Where the target is a copy of the online networks, one pass serves both: a shortcut, not another algorithm."""
+    models = []
+    for shortcut in (True, False):
+        settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}
+        model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
+        assert model._target_is_online
+        model._target_is_online = shortcut
+        models.append(model.learn(150))
+    assert same_state(*models)

@@ -1,0 +1,87 @@
+"""Small environments for the tests."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+
+class ChainEnv(gym.Env):
+    """A noisy walk whose whole state can be read and set. Ends at either side, or by a time-out."""
+
+    def __init__(self, length: int = 20):
+        self.observation_space = spaces.Box(-1, 1, (3,), np.float32)
+        self.action_space = spaces.Discrete(3)
+        self.length = length
+        self.rng = np.random.default_rng(0)
+        self.position, self.time = 0.0, 0
+
+    def get_state(self):
+        return self.position, self.time, self.rng.bit_generator.state
+
+    def set_state(self, state):
+        self.position, self.time, self.rng.bit_generator.state = state
+
+    def observe(self):
+        return np.array([self.position, np.sin(3 * self.position), self.time / self.length], dtype=np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        self.position, self.time = float(self.rng.uniform(-0.3, 0.3)), 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.position = float(np.clip(self.position + 0.2 * (int(action) - 1) + self.rng.normal(0, 0.05), -1, 1))
+        self.time += 1
+        terminated = abs(self.position) >= 1
+        return self.observe(), self.position, terminated, self.time >= self.length and not terminated, {}
+
+
+class ImageEnv(gym.Env):
+    """Random images, channels first or last, with episodes of a fixed length."""
+
+    def __init__(self, shape=(36, 36, 1), length=7, dtype=np.uint8):
+        high = 255 if dtype == np.uint8 else 1
+        self.observation_space = spaces.Box(0, high, shape, dtype)
+        self.action_space = spaces.Discrete(3)
+        self.length, self.time = length, 0
+
+    def observe(self):
+        image = self.np_random.integers(0, 256, self.observation_space.shape)
+        if self.observation_space.dtype == np.uint8:
+            return image.astype(np.uint8)
+        return (image / 255).astype(self.observation_space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.time += 1
+        return self.observe(), float(action == 1), self.time % (2 * self.length) == 0, self.time == self.length, {}
+
+
+class PoisonEnv(ChainEnv):
+    """Turns bad at a chosen step: ``where`` is "obs", "reward", "terminal" or "reset"."""
+
+    def __init__(self, where: str, value: float = np.nan, at: int = 50):
+        super().__init__()
+        self.where, self.value, self.at, self.steps = where, value, at, 0
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = super().reset(seed=seed, options=options)
+        return (obs * self.value if self.where == "reset" else obs), info
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.steps += 1
+        if self.steps == self.at:
+            if self.where == "obs":
+                obs = obs * self.value
+            elif self.where == "terminal":
+                obs, terminated = obs * self.value, True
+            elif self.where == "reward":
+                reward = self.value
+        return obs, reward, terminated, truncated, info
