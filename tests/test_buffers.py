@@ -1,3 +1,4 @@
+import itertools
 import pickle
 
 import numpy as np
@@ -239,7 +240,7 @@ def test_dict_and_discrete_observations():
         }
         for _ in range(12)
     ]
-    for now, then in zip(made[:-1], made[1:], strict=True):
+    for now, then in itertools.pairwise(made):
         buffer.add(now, then, np.array([0, 1]), np.zeros(2), np.zeros(2, dtype=bool), [{}, {}])
     samples = buffer.sample(100)
     for b, index in enumerate(samples.indices):

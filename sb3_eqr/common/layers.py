@@ -145,12 +145,12 @@ class ConvTrunk(nn.Sequential):
             nn.ReLU(inplace=True),
             nn.Flatten(),
         )
-        # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU.
-        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """
         :param images: (B, C, H, W), floating point, H and W at least 36
         :return: (B, features)
         """
+        # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU. Weights stay as they are,
+        # since the orthogonal initialisation of stock PPO takes no other layout.
         return super().forward(images.contiguous(memory_format=th.channels_last))

@@ -1,0 +1,259 @@
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_eqr.common.groups import make_group
+from sb3_eqr.common.latent_model import LatentModel
+
+
+def identity(states):
+    return states
+
+
+class ActionAngle(nn.Module):
+    """The true κ of a world where action 0 turns by +θ and action 1 by −θ, whatever the state."""
+
+    def __init__(self, theta):
+        super().__init__()
+        self.theta = theta
+
+    def forward(self, state_and_action):
+        return self.theta * (state_and_action[:, -2:-1] - state_and_action[:, -1:])
+
+
+class Constant(nn.Module):
+    def __init__(self, *values):
+        super().__init__()
+        self.values = th.tensor([values], dtype=th.float64)
+
+    def forward(self, inputs):
+        return self.values.expand(len(inputs), -1)
+
+
+def rotation(angles):
+    cos, sin = np.cos(angles), np.sin(angles)
+    return th.tensor(np.stack([cos, sin, -sin, cos], axis=-1))  # flattened [[cos, sin], [-sin, cos]]
+
+
+def rotation_world(kappa, rho_angle=0.0, mask=None):
+    """Losses on three starts and a few actions; the true world turns by ±0.7 radians."""
+    model = LatentModel(make_group("SO(2)"), 1, 2).double()
+    model.transition, model.action_symmetry, model.projection = kappa, Constant(rho_angle), nn.Identity()
+    model.reward_net = Constant(0.25)
+    target = LatentModel(make_group("SO(2)"), 1, 2).double()
+    target.transition, target.projection = ActionAngle(0.7), nn.Identity()
+    starts = np.array([0.0, 1.0, -2.5])
+    actions = th.tensor([[0, 0, 1], [1, 1, 1], [0, 1, 0]])
+    turns = np.cumsum(np.where(actions == 0, 0.7, -0.7), axis=1)
+    angles = np.concatenate([starts[:, None], starts[:, None] + turns], axis=1)
+    rewards = th.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.25, 0.25, 0.25]], dtype=th.float64)
+    mask = th.ones(3, 3, dtype=th.float64) if mask is None else mask
+    return model(rotation(starts), actions, rewards, mask, rotation(angles), target, identity, identity), turns
+
+
+def test_the_true_kappa_has_no_transition_loss():
+    losses, _ = rotation_world(ActionAngle(0.7))
+    assert losses.aet.abs().max() < 1e-14
+    assert losses.get.abs().max() < 1e-14
+
+
+def test_wrong_kappas_cost_what_geometry_says():
+    """Two unit-normed rotation matrices that differ by the angle δ lie 2 − 2 cos δ apart."""
+    losses, turns = rotation_world(ActionAngle(0.0))  # never moves
+    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).sum(axis=1), atol=1e-12)
+    np.testing.assert_allclose(losses.get, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
+    losses, turns = rotation_world(ActionAngle(-0.7))  # moves the wrong way
+    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).sum(axis=1), atol=1e-12)
+
+
+def test_a_wrong_rho_costs_get_alone():
+    losses, _ = rotation_world(ActionAngle(0.7), rho_angle=0.4)
+    assert losses.aet.abs().max() < 1e-14
+    np.testing.assert_allclose(losses.get, [2 - 2 * math.cos(0.4)] * 3, atol=1e-12)
+
+
+def test_reward_loss_by_hand():
+    losses, _ = rotation_world(ActionAngle(0.7))  # predicts 0.25 everywhere
+    expected = [0.75**2 + 2 * 0.25**2, 2 * 0.25**2 + 1.25**2, 0.0]
+    np.testing.assert_allclose(losses.reward, expected, atol=1e-12)
+
+
+def test_every_loss_obeys_the_mask():
+    mask = th.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 0.0]], dtype=th.float64)
+    losses, turns = rotation_world(ActionAngle(0.0), mask=mask)
+    np.testing.assert_allclose(losses.aet, ((2 - 2 * np.cos(turns)) * mask.numpy()).sum(axis=1), atol=1e-12)
+    np.testing.assert_allclose(losses.reward, [0.75**2, 2 * 0.25**2 + 1.25**2, 0.0], atol=1e-12)
+    losses, _ = rotation_world(ActionAngle(0.0), mask=th.zeros(3, 3, dtype=th.float64))
+    assert all((loss == 0).all() for loss in losses)
+
+
+def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", batch=6, depth=4, seed=0):
+    th.manual_seed(seed)
+    made = make_group(group)
+    model = LatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
+    target = LatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
+    target.requires_grad_(False).eval()
+    params = th.randn(batch, depth + 1, n_blocks, made.num_params, dtype=th.float64)
+    case = {
+        "state": made.element(th.randn(batch, n_blocks, made.num_params, dtype=th.float64)).flatten(1),
+        "actions": th.randint(5, (batch, depth)),
+        "rewards": th.randn(batch, depth, dtype=th.float64),
+        "mask": th.ones(batch, depth, dtype=th.float64),
+        "target_states": made.element(params).flatten(2),
+        "target": target,
+        "project": nn.Linear(3 * n_blocks * 3, 7).double(),
+        "target_project": nn.Linear(3 * n_blocks * 3, 7).double().requires_grad_(False),
+    }
+    return model, case
+
+
+def test_against_loops_over_samples_and_blocks():
+    """The whole of Eq. 18 and 19, one sample and one 3×3 matrix at a time; SE(2) does not commute, so order matters."""
+    model, case = random_case()
+    model.eval()
+    state = th.get_rng_state()
+    losses = model(**case)
+    th.set_rng_state(state)
+    partners = th.randint(6, (6,))
+
+    def se2(params):
+        c, s = np.cos(params[0]), np.sin(params[0])
+        return np.array([[c, s, params[1]], [-s, c, params[2]], [0, 0, 1]])
+
+    def run(network, *inputs):
+        with th.no_grad():
+            return network(th.tensor(np.concatenate(inputs))[None])[0].numpy()
+
+    def elements(network, *inputs):
+        return [se2(p) for p in run(network, *inputs).reshape(3, 3)]
+
+    def blocks(flat):
+        return list(flat.reshape(3, 3, 3))
+
+    def distance(a, b):
+        return np.sum((a / np.linalg.norm(a) - b / np.linalg.norm(b)) ** 2)
+
+    for i in range(6):
+        x = case["state"][i].numpy()
+        aet = reward = 0.0
+        predictions = []
+        for m in range(4):
+            action = np.eye(5)[case["actions"][i, m]]
+            moved = [k @ b for k, b in zip(elements(model.transition, x, action), blocks(x), strict=True)]
+            x = np.stack(moved).ravel()
+            predictions.append(x)
+            truth = case["target_states"][i, m + 1].numpy()
+            aet += distance(run(case["project"], x), run(case["target_project"], truth))
+            reward += (run(model.reward_net, x)[0] - case["rewards"][i, m].item()) ** 2
+        assert losses.aet[i].item() == pytest.approx(aet, rel=1e-10)
+        assert losses.reward[i].item() == pytest.approx(reward, rel=1e-10)
+
+        start, partner = case["state"][i].numpy(), case["target_states"][partners[i], 0].numpy()
+        symmetry = [p @ np.linalg.inv(s) for p, s in zip(blocks(partner), blocks(start), strict=True)]
+        left = np.stack([g @ b for g, b in zip(symmetry, blocks(predictions[0]), strict=True)]).ravel()
+        rho = elements(model.action_symmetry, np.stack(symmetry).ravel())
+        kappa = elements(case["target"].transition, start, np.eye(5)[case["actions"][i, 0]])
+        right = np.stack([r @ k @ p for r, k, p in zip(rho, kappa, blocks(partner), strict=True)]).ravel()
+        get = distance(run(model.projection, left), run(case["target"].projection, right))
+        assert losses.get[i].item() == pytest.approx(get, rel=1e-10)
+
+
+@pytest.mark.parametrize("reward_loss", ["mse", "categorical"])
+def test_what_lies_behind_the_mask_has_no_influence(reward_loss):
+    """Not on the other samples either, although batch norm looks at the whole batch."""
+    model, case = random_case(reward_loss=reward_loss)
+    model.train()
+    case["mask"] = th.tensor([[1, 1, 1, 1]] * 4 + [[1, 0, 0, 0], [1, 1, 1, 0]], dtype=th.float64)
+    case["state"].requires_grad_()
+
+    def run(**changes):
+        th.manual_seed(1)
+        model.zero_grad()
+        case["state"].grad = None
+        losses = model(**{**case, **changes})
+        sum(loss.sum() for loss in losses).backward()
+        return [*losses, case["state"].grad.clone(), *(p.grad.clone() for p in model.parameters())]
+
+    rewards, actions, targets = case["rewards"].clone(), case["actions"].clone(), case["target_states"].clone()
+    hidden = case["mask"] == 0
+    rewards[hidden], actions[hidden] = -77.0, 4
+    targets[:, 1:][hidden] = 123.0
+    before = run()
+    after = run(rewards=rewards, actions=actions, target_states=targets)
+    assert all(th.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_gradients_go_where_the_design_says():
+    model, case = random_case()
+    state = case["state"].requires_grad_()
+    th.manual_seed(0)
+    losses = model(**case)
+
+    def grads(loss):
+        inputs = {"state": state, **dict(model.named_parameters()), "p": case["project"].weight}
+        found = th.autograd.grad(loss.sum(), list(inputs.values()), retain_graph=True, allow_unused=True)
+        return {name.split(".")[0] for name, grad in zip(inputs, found, strict=True) if grad is not None}
+
+    assert grads(losses.aet) == {"state", "transition", "p"}
+    assert grads(losses.reward) == {"state", "transition", "reward_net"}
+    assert grads(losses.get) == {"state", "transition", "action_symmetry", "projection"}
+    assert all(p.grad is None for p in case["target"].parameters())
+
+
+def test_the_group_action_between_states_carries_no_gradient():
+    """
+    On SO(2) with a κ that ignores the state, τ_g · κ · x₀ does not depend on the angle a of x₀: were τ_g to carry a
+    gradient, d GET / da would be 0. Held fixed, GET = 2 − 2 cos(δ + a − a₀) with δ = −ρ, so d GET / da = −2 sin ρ.
+    """
+    model = LatentModel(make_group("SO(2)"), 1, 2).double()
+    model.transition, model.projection, model.reward_net = Constant(0.3), nn.Identity(), None
+    model.action_symmetry = Constant(0.9)
+    angles = th.tensor([[0.2], [1.5], [-0.8]], dtype=th.float64, requires_grad=True)
+    state = model.group.element(angles).flatten(1)
+    targets = rotation(np.zeros((3, 2)))
+    losses = model(state, th.zeros(3, 1).long(), th.zeros(3, 1), th.ones(3, 1), targets, model, identity, identity)
+    losses.get.sum().backward()
+    np.testing.assert_allclose(angles.grad, np.full((3, 1), -2 * np.sin(0.9)), atol=1e-12)
+
+
+@pytest.mark.parametrize("group", ["GL(2)", "SE(2)", "SO(3)", "T(2)", "SE(2)^2 x SO(3)"])
+def test_every_group_trains(group):
+    made = make_group(group)
+    th.manual_seed(0)
+    model = LatentModel(made, 2, 3)
+    size = 2 * int(np.prod(made.element_shape))
+    states = made.element(th.randn(8, 4, 2, made.num_params)).flatten(2)
+    state = states[:, 0].clone().requires_grad_()
+    losses = model(
+        state, th.randint(3, (8, 3)), th.randn(8, 3), th.ones(8, 3), states, model, nn.Linear(size, 5), nn.Linear(size, 5)
+    )
+    sum(loss.sum() for loss in losses).backward()
+    assert all(loss.shape == (8,) and th.isfinite(loss).all() for loss in losses)
+    assert th.isfinite(state.grad).all() and all(th.isfinite(p.grad).all() for p in model.parameters())
+
+
+def test_a_singular_state_neither_stops_nor_poisons():
+    made = make_group("GL(2)")
+    model = LatentModel(made, 2, 3)
+    state = th.zeros(4, 8, requires_grad=True)
+    losses = model(
+        state, th.zeros(4, 2, dtype=th.int64), th.zeros(4, 2), th.ones(4, 2), th.zeros(4, 3, 8), model, identity, identity
+    )
+    sum(loss.sum() for loss in losses).backward()
+    assert th.isfinite(state.grad).all() and all(th.isfinite(loss).all() for loss in losses)
+
+
+def test_parts_that_are_off_are_not_built():
+    model = LatentModel(make_group("SE(2)"), 2, 3, reward_loss=None, with_symmetry=False)
+    assert {name.split(".")[0] for name, _ in model.named_parameters()} == {"transition"}
+    with pytest.raises(ValueError, match=r"\['mse', 'categorical'\]"):
+        LatentModel(make_group("SE(2)"), 2, 3, reward_loss="huber")
+    with pytest.raises(ValueError, match="get_coef=0"):
+        LatentModel(make_group("none"), 1, 3)
+    free = LatentModel(make_group("none(6)"), 1, 3, with_symmetry=False)
+    one_hot = th.eye(3)
+    expected = free.eval().transition(th.cat([th.ones(3, 6), one_hot], dim=1))
+    assert th.equal(free.rollout(th.ones(3, 6), one_hot[:, None], th.ones(3, 1))[:, 0], expected)

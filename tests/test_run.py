@@ -1,0 +1,446 @@
+"""What sb3-contrib's suite asks of QRDQN, asked of EqRQRDQN: running, spaces, modes, callbacks, loggers."""
+
+import re
+from copy import deepcopy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import QRDQN
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import (
+    FakeImageEnv,
+    IdentityEnv,
+    IdentityEnvBox,
+    IdentityEnvMultiBinary,
+    IdentityEnvMultiDiscrete,
+    SimpleMultiObsEnv,
+)
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from torch import nn
+
+from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
+from sb3_eqr.common.eqr_algorithm import METRICS
+from tests.toys import ChainEnv, ImageEnv
+
+SMALL = {
+    "learning_starts": 40,
+    "buffer_size": 500,
+    "batch_size": 8,
+    "n_steps": 3,
+    "prediction_depth": 2,
+    "device": "cpu",
+    "seed": 0,
+}
+NET = {"net_arch": [32], "n_quantiles": 9, "n_blocks": 3, "latent_hidden_dim": 16}
+
+
+def make(env, policy="MlpPolicy", **kwargs):
+    policy_kwargs = {**NET, **kwargs.pop("policy_kwargs", {})}
+    return EqRQRDQN(policy, env, **{**SMALL, **kwargs}, policy_kwargs=policy_kwargs)
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy", "MultiInputPolicy"])
+def test_every_policy_runs_and_every_part_learns(policy):
+    envs = {"MlpPolicy": ChainEnv, "CnnPolicy": ImageEnv, "MultiInputPolicy": SimpleMultiObsEnv}
+    model = make(envs[policy](), policy)
+    before = deepcopy(model.policy.state_dict())
+    model.learn(60)
+    after = model.policy.state_dict()
+    frozen = [n for n, p in model.policy.named_parameters() if p.requires_grad and th.equal(before[n], after[n])]
+    assert frozen == []
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"train_freq": 4},
+        {"train_freq": (3, "step"), "gradient_steps": -1},
+        {"train_freq": (1, "episode")},
+        {"n_steps": 1},
+        {"n_steps": 10, "prediction_depth": 0},
+        {"reward_loss": "categorical"},
+        {"get_coef": 0, "reward_coef": 0},
+        {"aet_coef": 0, "get_coef": 0},
+        {"aet_coef": 0, "reward_coef": 0},
+        {"double_q": False, "prioritized_replay": False, "tau": 0.01},
+        {"target_update_interval": 30},
+        {"policy_kwargs": {"dueling": False}},
+        {"policy_kwargs": {"noisy": False}},
+        {"policy_kwargs": {"net_arch": [], "shared_projection": False}},
+        {"policy_kwargs": {"group": "GL(2)"}},
+        {"policy_kwargs": {"group": "SO(3)", "parameterization": "exp"}},
+        {"policy_kwargs": {"group": "SE(2)^2 x SO(3)", "n_blocks": None}},
+        {"policy_kwargs": {"group": "none(8)", "n_blocks": None}, "get_coef": 0},
+        {"policy_kwargs": {"group": None}, "get_coef": 0},
+        {"policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.1}}},
+        {"learning_rate": lambda progress: 1e-3 * progress, "max_grad_norm": None},
+        {"replay_buffer_class": SequenceReplayBuffer, "learning_starts": 0},
+    ],
+    ids=lambda kwargs: re.sub(" at 0x\\w+", "", str(kwargs)),
+)
+def test_every_switch_runs(kwargs):
+    model = make(ChainEnv(), **kwargs).learn(80)
+    assert model._n_updates > 0
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("env", [IdentityEnvBox(eps=0.5), IdentityEnvMultiBinary(), IdentityEnvMultiDiscrete()])
+def test_wrong_action_spaces_are_refused(env):
+    with pytest.raises(AssertionError, match="Wrap the environment with discrete actions"):
+        make(env)
+
+
+@pytest.mark.parametrize("n_envs", [2, 5])
+def test_several_environments(n_envs):
+    model = make(make_vec_env(ChainEnv, n_envs), train_freq=2).learn(100)
+    assert model.replay_buffer.n_envs == n_envs and model._n_updates > 0
+    with pytest.raises(AssertionError, match="one env when doing episodic training"):
+        make(make_vec_env(ChainEnv, 2), train_freq=(1, "episode")).learn(10)
+
+
+def test_the_callers_dictionaries_are_left_alone():
+    policy_kwargs, buffer_kwargs = {"net_arch": [16]}, {"handle_timeout_termination": False}
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL, policy_kwargs=policy_kwargs, replay_buffer_kwargs=buffer_kwargs)
+    model.learn(60)
+    assert policy_kwargs == {"net_arch": [16]} and buffer_kwargs == {"handle_timeout_termination": False}
+    assert model.policy.optimizer.defaults["eps"] == 1.5e-4  # Table 5
+    own = make(ChainEnv(), policy_kwargs={"optimizer_kwargs": {"betas": (0.5, 0.9)}})
+    assert own.policy.optimizer.defaults["betas"] == (0.5, 0.9) and own.policy.optimizer.defaults["eps"] == 1.5e-4
+
+
+def test_the_learning_rate_schedule_reaches_the_latent_model():
+    model = make(ChainEnv(), learning_rate=lambda progress: 1e-3 * progress).learn(100)
+    rates = {group["lr"] for group in model.policy.optimizer.param_groups}
+    assert len(model.policy.optimizer.param_groups) == 2 and rates == {1e-3 * (1 - 100 / 100)}
+
+
+def test_defaults_are_those_of_table_5():
+    model = EqRQRDQN("CnnPolicy", VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4), device="cpu")
+    assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
+    assert (model.learning_starts, model.gradient_steps, model.n_steps, model.prediction_depth) == (2000, 2, 10, 5)
+    assert (model.train_freq.frequency, model.train_freq.unit.value, model.tau) == (1, "step", 1.0)
+    assert (model.priority_alpha, model.priority_beta) == (0.5, 0.4)
+    assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
+    assert (model.aet_coef, model.get_coef, model.reward_coef) == (1, 1, 1)
+    assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
+    adam = model.policy.optimizer.defaults
+    assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
+    network = model.quantile_net
+    encoder = network.features_extractor
+    assert (network.n_quantiles, network.net_arch, network.dueling, network.sigma_init) == (51, [256], True, 0.5)
+    assert (str(encoder.group), encoder.n_blocks, encoder.features_dim) == ("SE(2)", 12, 108)
+    assert sum(p.numel() for p in encoder.to_algebra.parameters()) == (3136 + 1) * 36
+    assert model.policy.latent_model.transition[0].out_features == 256
+    assert model.frame_stack == 4
+
+
+# ---------------------------------------------------------------------------------------------- observations
+
+
+@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 40, 36)])
+def test_images_channels_first_and_last(shape):
+    model = make(ImageEnv(shape), "CnnPolicy").learn(60)
+    obs = model.get_env().reset()
+    assert obs.shape == (1, 3, 40, 36)
+    raw = ImageEnv(shape).observation_space.sample()
+    action, _ = model.predict(raw, deterministic=True)
+    assert action.shape == ()
+    first = raw if shape[0] == 3 else raw.transpose(2, 0, 1)
+    assert model.predict(first[None], deterministic=True)[0].tolist() == [action]
+
+
+def test_images_that_are_floats_already():
+    env = ImageEnv((3, 40, 36), dtype=np.float32)
+    model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(60)
+    assert model._image_keys == [""]  # augmented like the others
+    with pytest.raises(ValueError, match="normalize_images=False"):
+        make(env, "CnnPolicy")
+    with pytest.raises(ValueError, match="MlpPolicy for vectors"):
+        make(ChainEnv(), "CnnPolicy")
+    with pytest.raises(ValueError, match="at least 36x36"):
+        make(ImageEnv((3, 20, 20)), "CnnPolicy")
+
+
+class TinyExtractor(BaseFeaturesExtractor):
+    def __init__(self, observation_space, features_dim=5):
+        super().__init__(observation_space, features_dim)
+        n_input = int(np.prod(observation_space.shape))
+        self.net = nn.Sequential(nn.Flatten(), nn.Linear(n_input, features_dim), nn.BatchNorm1d(features_dim), nn.ReLU())
+
+    def forward(self, obs):
+        return self.net(obs)
+
+
+def test_a_custom_extractor_becomes_the_trunk():
+    kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(60)
+    encoder = model.quantile_net.features_extractor
+    assert isinstance(encoder, GroupFeaturesExtractor) and isinstance(encoder.trunk, TinyExtractor)
+    assert encoder.to_algebra.in_features == 7
+    assert not model._target_is_online  # batch norm: online features in train mode are no target features
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(60)
+    assert model.quantile_net.features_extractor.to_algebra.in_features == 512
+
+
+@pytest.mark.parametrize("algorithm", [QRDQN, DQN, PPO])
+@pytest.mark.parametrize(
+    "env, policy", [(ChainEnv, "MlpPolicy"), (ImageEnv, "CnnPolicy"), (SimpleMultiObsEnv, "MultiInputPolicy")]
+)
+def test_the_group_encoder_serves_stock_algorithms(algorithm, env, policy):
+    policy_kwargs = {
+        "features_extractor_class": GroupFeaturesExtractor,
+        "features_extractor_kwargs": {"group": "SO(3)", "n_blocks": 4},
+    }
+    kwargs = {"n_steps": 32, "batch_size": 16} if algorithm is PPO else {"learning_starts": 16, "buffer_size": 100}
+    model = algorithm(policy, env(), policy_kwargs=policy_kwargs, device="cpu", **kwargs).learn(40)
+    features = model.policy.extract_features(
+        *(model.policy.obs_to_tensor(model.get_env().reset())[:1]),
+        model.policy.features_extractor if algorithm is PPO else online_network(model).features_extractor,
+    )
+    blocks = features.view(-1, 4, 3, 3)
+    th.testing.assert_close(blocks @ blocks.mT, th.eye(3).expand_as(blocks), rtol=0, atol=1e-5)
+
+
+def online_network(model):
+    return model.quantile_net if isinstance(model, QRDQN) else model.q_net
+
+
+@pytest.mark.parametrize("env", [lambda: gym.make("FrozenLake-v1"), lambda: gym.make("CliffWalking-v1")])
+def test_discrete_observations(env):
+    make(env()).learn(80)
+
+
+@pytest.mark.parametrize("space", [spaces.MultiDiscrete([4, 3]), spaces.MultiBinary(5)])
+def test_multi_discrete_and_multi_binary_observations(space):
+    class Env(ChainEnv):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = space
+
+        def observe(self):
+            return self.observation_space.sample()
+
+    assert make(Env()).learn(80)._n_updates > 0
+
+
+def test_dict_observations_are_augmented_where_they_are_images():
+    model = make(SimpleMultiObsEnv(channel_last=True), "MultiInputPolicy")
+    assert model._image_keys == ["img"]
+    model.learn(60)
+    obs = {"img": th.randint(0, 256, (4, 1, 36, 36), dtype=th.uint8), "vec": th.rand(4, 5)}
+    augmented = model._augment(obs)
+    assert th.equal(augmented["vec"], obs["vec"]) and not th.equal(augmented["img"], obs["img"].float())
+    with pytest.raises(ValueError, match="MultiInputPolicy"):
+        make(SimpleMultiObsEnv(), "MlpPolicy")
+
+
+def test_frame_stacks_are_found_and_stored_once():
+    env = VecFrameStack(make_vec_env(ImageEnv, 2), 4)
+    model = make(env, "CnnPolicy", buffer_size=400).learn(100)
+    assert model.frame_stack == 4 and model.replay_buffer.nbytes / 400 < 1.3 * 36 * 36
+    whole = make(env, "CnnPolicy", buffer_size=400, replay_buffer_kwargs={"frame_stack": 1}).learn(100)
+    assert whole.frame_stack == 1
+    np.random.seed(0)
+    a = model.replay_buffer.sample(200)
+    np.random.seed(0)
+    b = whole.replay_buffer.sample(200)
+    assert a.rollout_observations.shape == b.rollout_observations.shape == (200, 2, 4, 36, 36)
+
+
+# ---------------------------------------------------------------------------------------------- modes
+
+
+def test_batch_norm_moves_in_training_only():
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": TinyExtractor}, learning_starts=30)
+
+    def statistics():
+        return [b.clone() for name, b in model.policy.named_buffers() if "running_" in name or "batches" in name]
+
+    start = statistics()
+    assert len(start) > 0
+    model.learn(25)  # no update yet: collecting must not move them
+    obs = model.get_env().reset()
+    for _ in range(3):
+        model.predict(obs, deterministic=True)
+        model.predict(obs, deterministic=False)
+    assert all(th.equal(a, b) for a, b in zip(start, statistics(), strict=True))
+    model.learn(40)
+    trained = statistics()
+    assert not all(th.equal(a, b) for a, b in zip(start, trained, strict=True))
+    model.predict(obs)
+    evaluate_policy(model, model.get_env(), n_eval_episodes=2)
+    assert all(th.equal(a, b) for a, b in zip(trained, statistics(), strict=True))
+
+
+def test_train_mode_reaches_all_that_is_trained_and_nothing_else():
+    policy = make(ChainEnv()).policy
+    for mode in (True, False):
+        policy.set_training_mode(mode)
+        assert policy.training == mode and policy.quantile_net.training == mode
+        assert all(module.training == mode for module in policy.latent_model.modules())
+        assert not any(m.training for m in [*policy.quantile_net_target.modules(), *policy.latent_model_target.modules()])
+
+
+def test_the_one_target_copy_follows():
+    model = make(ChainEnv()).learn(80)
+    pairs = model.policy._target_pairs()
+    assert len(pairs) == 3  # encoder with Q head, κ, b
+    for online, target in pairs:
+        for a, b in zip(online.state_dict().values(), target.state_dict().values(), strict=True):
+            assert th.equal(a, b) or a.dtype == th.int64  # num_batches_tracked is not used by inference
+    slow = make(ChainEnv(), tau=0.5)
+    before = [p.clone() for _, target in slow.policy._target_pairs() for p in target.parameters()]
+    with th.no_grad():
+        for online, _ in slow.policy._target_pairs():
+            for p in online.parameters():
+                p.add_(1.0)
+    slow.policy.update_target(0.5)
+    after = [p for _, target in slow.policy._target_pairs() for p in target.parameters()]
+    for a, b in zip(before, after, strict=True):
+        th.testing.assert_close(b, a + 0.5)
+
+
+def test_exploration_is_random_then_noisy_and_prediction_is_neither():
+    model = make(ChainEnv(), learning_starts=0, exploration_fraction=0.5)
+    model.policy.quantile_net.head.advantage[-1].weight_sigma.data.fill_(1.0)
+    model.learn(20)
+    assert model.exploration_rate == 0.0  # ε has come down; only noise explores
+    obs = np.zeros((1, 3), dtype=np.float32)
+    model.policy.set_training_mode(False)  # as collect_rollouts does
+    noisy = {int(model.predict(obs, deterministic=False)[0][0]) for _ in range(60)}
+    clean = {int(model.predict(obs, deterministic=True)[0][0]) for _ in range(60)}
+    assert len(noisy) > 1 and len(clean) == 1
+    rates = [model.exploration_schedule(progress) for progress in (1.0, 0.75, 0.5, 0.0)]
+    np.testing.assert_allclose(rates, [1.0, 0.5, 0.0, 0.0], atol=1e-12)
+
+
+def test_beta_and_counters():
+    model = make(ChainEnv(), train_freq=1, gradient_steps=3, learning_starts=50, priority_beta=0.4)
+    model.learn(100)
+    assert model._n_updates == 3 * 50
+    # The last update was made when all steps were done, so β has reached 1.
+    assert model.replay_buffer.beta == pytest.approx(1.0)
+    model._current_progress_remaining = 0.5
+    model.train(1, 8)
+    assert model.replay_buffer.beta == pytest.approx(0.7)
+
+
+def test_a_schedule_may_move_n_and_gamma():
+    model = make(ChainEnv()).learn(60)
+    model.n_steps, model.gamma = 2, 0.5
+    model.train(1, 8)
+    assert model.replay_buffer.n_steps == 2
+    samples = model.replay_buffer.sample(100)
+    assert set(samples.discounts.flatten().tolist()) <= {0.5, 0.25}
+
+
+# ---------------------------------------------------------------------------------------------- learning
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_identity_environment_is_learned(n_steps):
+    env = DummyVecEnv([lambda: IdentityEnv(10)])
+    model = make(
+        env,
+        n_steps=n_steps,
+        gamma=0.4,
+        learning_rate=1e-3,
+        gradient_steps=1,
+        learning_starts=100,
+        batch_size=32,
+        exploration_fraction=0.3,
+        exploration_final_eps=0.05,
+        policy_kwargs={"n_quantiles": 25, "net_arch": [64], "n_blocks": 12, "noisy": False},
+        buffer_size=3000,
+    ).learn(1000)
+    evaluate_policy(model, env, n_eval_episodes=20, reward_threshold=90, warn=False)
+    obs = env.reset()
+    assert np.shape(model.predict(obs)[0]) == np.shape(obs)
+
+
+def test_vec_normalize():
+    env = VecNormalize(make_vec_env(ChainEnv, 2))
+    model = make(env).learn(100)
+    samples = model.replay_buffer.sample(50, env=env)
+    raw = model.replay_buffer._observations(*np.divmod(samples.indices, 2), None)
+    np.testing.assert_allclose(samples.observations, env.normalize_obs(raw.numpy()), rtol=1e-6)
+    assert samples.rollout_rewards.abs().max() <= env.clip_reward
+    model.learn(20, reset_num_timesteps=False)
+
+
+def test_predict_shapes():
+    model = make(make_vec_env(ChainEnv, 3))
+    obs = np.zeros((3, 3), dtype=np.float32)
+    assert model.predict(obs)[0].shape == (3,)
+    assert model.predict(obs[0])[0].shape == ()
+    assert model.policy(th.zeros(4, 3)).shape == (4,)
+    assert model.quantile_net(th.zeros(4, 3)).shape == (4, 9, 3)
+    with pytest.raises(ValueError, match="Gym API"):
+        model.predict(ChainEnv().reset())
+
+
+def test_eval_and_checkpoint_callbacks(tmp_path):
+    callbacks = [
+        EvalCallback(make_vec_env(ChainEnv), eval_freq=40, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0),
+        CheckpointCallback(50, str(tmp_path), save_replay_buffer=True, save_vecnormalize=True),
+    ]
+    env = VecNormalize(make_vec_env(ChainEnv))
+    eval_env = VecNormalize(make_vec_env(ChainEnv), training=False)
+    callbacks[0].eval_env = eval_env
+    make(env).learn(120, callback=callbacks)
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"best_model.zip", "rl_model_50_steps.zip", "rl_model_replay_buffer_100_steps.pkl"} <= made
+    assert not any("partial" in name for name in made)
+    model = EqRQRDQN.load(tmp_path / "rl_model_100_steps", env=env)
+    model.load_replay_buffer(tmp_path / "rl_model_replay_buffer_100_steps")
+    assert model.replay_buffer.size() == 99
+    model.learn(30, reset_num_timesteps=False)
+
+
+# ---------------------------------------------------------------------------------------------- logger
+
+
+def test_logger_has_every_key_and_reads_only_when_dumped(tmp_path, monkeypatch):
+    model = make(ChainEnv(length=10))
+    model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+    reads = []
+    plain = th.Tensor.item
+    monkeypatch.setattr(th.Tensor, "item", lambda self: reads.append(1) or plain(self))
+    recorded = {}
+    monkeypatch.setattr(model.logger, "dump", lambda step=0: recorded.update(model.logger.name_to_value))
+    model.learn(100, log_interval=1)
+    keys = {f"train/{name}" for name in METRICS} | {"train/beta", "train/n_updates", "train/learning_rate"}
+    assert keys <= recorded.keys()
+    assert {"rollout/ep_rew_mean", "rollout/exploration_rate", "time/fps"} <= recorded.keys()
+    assert all(np.isfinite(recorded[key]) and isinstance(recorded[key], (float, int)) for key in keys)
+
+
+def test_logged_figures_are_means_over_the_updates_since_the_last_dump():
+    model = make(ChainEnv())
+    model.set_logger(configure(None, []))
+    for value in (1.0, 3.0):
+        model._monitor.add([th.tensor(value + k) for k in range(len(METRICS))])
+    model._monitor.collect(2)
+    assert model._monitor.means() == {name: 2.0 + k for k, name in enumerate(METRICS)}
+    assert model._monitor.means() == {}
+
+
+def test_tensorboard(tmp_path):
+    make(ChainEnv(length=10), tensorboard_log=str(tmp_path)).learn(100, log_interval=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["EqRQRDQN_1"]
+    assert any("tfevents" in path.name for path in (tmp_path / "EqRQRDQN_1").iterdir())
+
+
+def test_progress_bar_and_fake_images():
+    env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=True)
+    make(env, "CnnPolicy").learn(50, progress_bar=True)
+    assert isinstance(env.action_space, spaces.Discrete)
