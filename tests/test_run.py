@@ -361,7 +361,7 @@ def test_identity_environment_is_learned(n_steps):
         exploration_final_eps=0.05,
         policy_kwargs={"n_quantiles": 25, "net_arch": [64], "n_blocks": 12, "noisy": False},
         buffer_size=3000,
-    ).learn(1000)
+    ).learn(1500)
     evaluate_policy(model, env, n_eval_episodes=20, reward_threshold=90, warn=False)
     obs = env.reset()
     assert np.shape(model.predict(obs)[0]) == np.shape(obs)

@@ -3,7 +3,7 @@
 import io
 import pathlib
 import pickle
-import zipfile
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from torch import nn
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.save_util import atomic_write, get_rng_state, set_rng_state
+from sb3_eqr.common.save_util import atomic_write, get_rng_state, is_whole_model, set_rng_state
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
 
@@ -50,6 +50,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
     max_grad_norm: float | None
     exploration_schedule: Schedule
     exploration_rate: float
+    exploration_final_eps: float
     _n_calls: int
 
     def __init__(
@@ -127,6 +128,11 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         super()._setup_model()
         self.__dict__.update(true)
 
+        if self.exploration_final_eps == 0 and not self.policy.noisy:
+            warnings.warn(
+                "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
+                "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
+            )
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         self._target_is_online = self._find_whether_target_is_online()
         self._monitor = UpdateMonitor(METRICS, self.policy, self.policy.optimizer)
@@ -389,9 +395,9 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         """
         if isinstance(path, (str, pathlib.Path)):
             found = next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
-            if found is not None and not zipfile.is_zipfile(found):
+            if found is not None and not is_whole_model(found):
                 raise ValueError(
-                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or no zip file. "
+                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or something else. "
                     "Load an earlier checkpoint."
                 )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

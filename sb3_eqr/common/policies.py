@@ -46,11 +46,15 @@ class EqRPolicy(BasePolicy):
 
     def _configure(
         self,
-        net_arch: list[int] | None,
+        *,
+        net_arch: list[int],
         group: str | Group | None,
         n_blocks: int | None,
         parameterization: str,
         latent_hidden_dim: int,
+        dueling: bool,
+        noisy: bool,
+        sigma_init: float,
         shared_projection: bool,
         latent_model_kwargs: dict[str, Any] | None,
     ) -> None:
@@ -63,6 +67,9 @@ class EqRPolicy(BasePolicy):
         self.n_blocks = n_blocks
         self.parameterization = parameterization
         self.latent_hidden_dim = latent_hidden_dim
+        self.dueling = dueling
+        self.noisy = noisy
+        self.sigma_init = sigma_init
         self.shared_projection = shared_projection
         self.latent_model_kwargs = latent_model_kwargs
 
@@ -163,6 +170,9 @@ class EqRPolicy(BasePolicy):
             n_blocks=self.n_blocks,
             parameterization=self.parameterization,
             latent_hidden_dim=self.latent_hidden_dim,
+            dueling=self.dueling,
+            noisy=self.noisy,
+            sigma_init=self.sigma_init,
             shared_projection=self.shared_projection,
             latent_model_kwargs=self.latent_model_kwargs,
         )

@@ -3,6 +3,7 @@
 import os
 import pathlib
 import random
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, BinaryIO
@@ -33,6 +34,19 @@ def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def is_whole_model(path: pathlib.Path) -> bool:
+    """
+    :param path: an existing file
+    :return: whether it is a zip file with everything that SB3's ``save`` puts in. The parts of a model are zip files
+        themselves, so one that was cut off may still look like a zip file.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
+    except zipfile.BadZipFile:
+        return False
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:

@@ -136,10 +136,18 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         latent_model_kwargs: dict[str, Any] | None = None,
     ):
         net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
-        self._configure(net_arch, group, n_blocks, parameterization, latent_hidden_dim, shared_projection, latent_model_kwargs)
-        self.dueling = dueling
-        self.noisy = noisy
-        self.sigma_init = sigma_init
+        self._configure(
+            net_arch=net_arch,
+            group=group,
+            n_blocks=n_blocks,
+            parameterization=parameterization,
+            dueling=dueling,
+            noisy=noisy,
+            sigma_init=sigma_init,
+            latent_hidden_dim=latent_hidden_dim,
+            shared_projection=shared_projection,
+            latent_model_kwargs=latent_model_kwargs,
+        )
         super().__init__(
             observation_space,
             action_space,
@@ -166,11 +174,6 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         net_args = self._update_features_extractor(self.net_args, features_extractor=None)
         sigma_init = self.sigma_init if self.noisy else None
         return EqRQuantileNetwork(**net_args, dueling=self.dueling, sigma_init=sigma_init).to(self.device)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(dueling=self.dueling, noisy=self.noisy, sigma_init=self.sigma_init)
-        return data
 
 
 MlpPolicy = EqRQRDQNPolicy

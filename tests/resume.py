@@ -1,0 +1,64 @@
+"""
+One half of the resuming test, run as a program of its own: load what the other half saved, go on, save.
+
+    python -m tests.resume FOLDER STEPS
+"""
+
+import pathlib
+import pickle
+import sys
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_eqr import EqRQRDQN
+from tests.toys import ChainEnv
+
+
+class Save(BaseCallback):
+    """Saves everything between two rounds of the training loop: after an update, before the next step."""
+
+    def __init__(self, folder: pathlib.Path, at: int):
+        super().__init__()
+        self.folder, self.at = folder, at
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps == self.at:
+            self.model.save(self.folder / "model")
+            self.model.save_replay_buffer(self.folder / "buffer")
+            env = self.model.get_env()
+            (self.folder / "env.pkl").write_bytes(pickle.dumps(env.env_method("get_state")))
+            if isinstance(env, VecNormalize):
+                env.save(str(self.folder / "normalize.pkl"))
+                (self.folder / "returns.pkl").write_bytes(pickle.dumps(env.returns))  # SB3 leaves them out
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def make_env(normalize: pathlib.Path | bool) -> VecEnv:
+    env = make_vec_env(ChainEnv, 2)
+    if normalize is True:
+        return VecNormalize(env)
+    return VecNormalize.load(str(normalize), env) if normalize else env
+
+
+def main(folder: pathlib.Path, steps: int) -> None:
+    th.set_num_threads(1)
+    normalize = folder / "normalize.pkl"
+    env = make_env(normalize if normalize.exists() else False)
+    env.unwrapped.reset()  # Monitor wants it; the states are set below
+    if isinstance(env, VecNormalize):
+        env.returns = pickle.loads((folder / "returns.pkl").read_bytes())
+    model = EqRQRDQN.load(folder / "model", env=env, device="cpu", force_reset=False)
+    model.load_replay_buffer(folder / "buffer")
+    for index, state in enumerate(pickle.loads((folder / "env.pkl").read_bytes())):
+        env.env_method("set_state", state, indices=index)
+    model.learn(steps, reset_num_timesteps=False)
+    model.save(folder / "continued")
+
+
+if __name__ == "__main__":
+    main(pathlib.Path(sys.argv[1]), int(sys.argv[2]))

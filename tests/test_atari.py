@@ -1,0 +1,173 @@
+"""The Atari-100K protocol, against ALE driven by hand."""
+
+import cv2
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.common.buffers import SequenceReplayBuffer
+from sb3_eqr.envs import atari, make_atari100k_env
+
+
+def games(env):
+    return env.venv.envs
+
+
+@pytest.mark.parametrize("game", ["Pong", "PongNoFrameskip-v4", "ALE/Pong-v5", "pong"])
+def test_all_names_of_a_game(game):
+    assert atari.atari_env_id(game) == "ALE/Pong-v5"
+
+
+def test_names_of_two_words_and_unknown_games():
+    assert atari.atari_env_id("MsPacman") == atari.atari_env_id("ms_pacman") == atari.atari_env_id("Ms Pacman")
+    assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
+    with pytest.raises(ValueError, match="did you mean Pong"):
+        make_atari100k_env("Pnog")
+    with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'CartPole-v1'"):
+        make_atari100k_env("CartPole-v1")
+
+
+def test_observations_and_rewards_against_the_emulator_by_hand():
+    seed = 5
+    env = make_atari100k_env("Breakout", seed=seed)
+    raw = gym.make("ALE/Breakout-v5", frameskip=1, repeat_action_probability=0.0).unwrapped
+    obs = env.reset()
+    screen, _ = raw.reset(seed=seed)
+    for _ in range(raw.np_random.integers(1, 31)):  # no-ops
+        screen, *_ = raw.step(0)
+
+    def grey(frame):
+        return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (84, 84), interpolation=cv2.INTER_AREA)
+
+    stack = [np.zeros((84, 84), np.uint8)] * 3 + [grey(screen)]
+    assert obs.shape == (1, 84, 84, 4) and obs.dtype == np.uint8
+    assert np.array_equal(obs[0], np.stack(stack, axis=-1))
+    rng = np.random.default_rng(0)
+    for _ in range(120):
+        action = int(rng.integers(4))
+        screens, reward = [], 0.0
+        for _ in range(4):
+            screen, r, terminated, _, _ = raw.step(action)
+            screens.append(screen)
+            reward += r
+        obs, rewards, dones, infos = env.step(np.array([action]))
+        if dones[0]:
+            obs = infos[0]["terminal_observation"][None]
+        stack = [*stack[1:], grey(np.maximum(*screens[-2:]))]
+        assert np.array_equal(obs[0], np.stack(stack, axis=-1))
+        assert rewards[0] == np.sign(reward)
+        if dones[0]:
+            return  # a life was lost: SB3's wrapper now steps once more
+        assert not terminated
+
+
+def test_no_fire_no_sticky_actions():
+    env = make_atari100k_env("Breakout", seed=0)
+    ale = games(env)[0].unwrapped.ale
+    assert ale.getFloat("repeat_action_probability") == 0.0
+    wrappers, layer = [], games(env)[0]
+    while layer is not layer.unwrapped:
+        wrappers.append(type(layer).__name__)
+        layer = layer.env
+    assert "FireResetEnv" not in wrappers and "StickyActionEnv" not in wrappers
+    env.reset()
+    for _ in range(50):
+        obs, *_ = env.step(np.array([0]))
+    quiet = obs.copy()
+    for _ in range(5):
+        obs, *_ = env.step(np.array([0]))
+    assert np.array_equal(obs, quiet)  # nothing moves until the agent itself presses FIRE
+    for action in (1, 1, 0, 0, 0):
+        obs, *_ = env.step(np.array([action]))
+    assert not np.array_equal(obs, quiet)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_life_loss_ends_an_episode_in_training_only(training):
+    env = make_atari100k_env("Breakout", seed=0, training=training)
+    env.reset()
+    dones, scores = 0, []
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        _, rewards, done, infos = env.step(np.array([int(rng.integers(4))]))
+        assert rewards[0] in ((0.0, 1.0) if training else (0.0, 1.0, 4.0, 7.0))
+        dones += done[0]
+        if "episode" in infos[0]:
+            scores.append(infos[0]["episode"])
+            break
+    assert dones == (5 if training else 1)  # Breakout has five lives
+    assert scores[0]["l"] > 100 and scores[0]["r"] >= 0
+
+
+def test_games_are_cut_at_the_step_limit(monkeypatch):
+    monkeypatch.setattr(atari, "MAX_STEPS", 30)
+    env = make_atari100k_env("Pong", seed=0)
+    env.reset()
+    for step in range(1, 61):
+        _, _, dones, infos = env.step(np.array([0]))
+        assert dones[0] == (step % 30 == 0)
+        if dones[0]:
+            assert infos[0]["TimeLimit.truncated"] and infos[0]["episode"]["l"] == 30
+    assert (atari.MAX_STEPS, atari.FRAME_SKIP) == (30, 4)
+
+
+def test_the_limit_is_that_of_the_paper():
+    env = make_atari100k_env("Pong", n_envs=2, seed=0)
+    assert atari.MAX_STEPS * atari.FRAME_SKIP == 108_000 and env.num_envs == 2
+    layer = games(env)[0]
+    while not isinstance(layer, gym.wrappers.TimeLimit):
+        layer = layer.env
+    assert layer._max_episode_steps == 27_000
+    env.reset()
+    first, second = (env.step(np.array([0, 0]))[0][i] for i in (0, 1))
+    assert not np.array_equal(first, second)  # other seeds, other no-ops
+
+
+def test_replay_of_real_games_is_that_of_the_plain_buffer():
+    """Lives lost, terminal observations, wrap-around: every frame bit by bit."""
+    env = make_atari100k_env("Breakout", n_envs=2, seed=0)
+    obs = env.reset().transpose(0, 3, 1, 2)
+    space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    plain = ReplayBuffer(300, space, env.action_space, "cpu", 2)
+    ours = SequenceReplayBuffer(300, space, env.action_space, "cpu", 2, frame_stack=4)
+    rng = np.random.default_rng(0)
+    ends = 0
+    for _ in range(260):
+        actions = rng.integers(4, size=2)
+        new_obs, rewards, dones, infos = env.step(actions)
+        new_obs = new_obs.transpose(0, 3, 1, 2)
+        next_obs = new_obs.copy()
+        for i in np.flatnonzero(dones):
+            next_obs[i] = infos[i]["terminal_observation"].transpose(2, 0, 1)
+        ends += dones.sum()
+        for buffer in (plain, ours):
+            buffer.add(obs, next_obs, actions, rewards, dones, infos)
+        obs = new_obs
+    assert ends > 3
+    np.random.seed(0)
+    a = plain.sample(400)
+    np.random.seed(0)
+    b = ours.sample(400)
+    for field in ("observations", "actions", "next_observations", "dones", "rewards"):
+        assert th.equal(getattr(a, field), getattr(b, field))
+    assert ours.nbytes / 300 < 8_500
+
+
+def test_the_main_job_in_small(tmp_path):
+    env = make_atari100k_env("Pong", n_envs=1, seed=0)
+    model = EqRQRDQN("CnnPolicy", env, seed=0, learning_starts=60, buffer_size=200)
+    model.learn(80)
+    model.dump_logs()
+    assert model._n_updates == 40 and model.frame_stack == 4
+    model.save(tmp_path / "pong")
+    loaded = EqRQRDQN.load(tmp_path / "pong", env=env)
+    obs = env.reset()
+    assert loaded.predict(obs, deterministic=True)[0] == model.predict(obs, deterministic=True)[0]
+    short = make_atari100k_env("Pong", seed=1, training=False)
+    games(short)[0].env.env.env._max_episode_steps = 40
+    mean, _ = evaluate_policy(loaded, short, n_eval_episodes=1)
+    assert -21 <= mean <= 21

@@ -1,0 +1,228 @@
+"""Saving, loading, going on, and files that are not what they should be."""
+
+import io
+import subprocess
+import sys
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch as th
+from sb3_contrib import QRDQN
+from stable_baselines3 import DQN
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+
+from sb3_eqr import EqRQRDQN, MatrixLieGroup
+from sb3_eqr.eqr_qrdqn.policies import EqRQRDQNPolicy, EqRQuantileNetwork
+from tests.resume import Save, make_env
+from tests.test_run import make
+from tests.toys import ChainEnv, ImageEnv
+
+POLICIES = pytest.mark.parametrize(
+    "policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv), ("MultiInputPolicy", SimpleMultiObsEnv)]
+)
+
+
+def equal_states(a, b):
+    return a.keys() == b.keys() and all(th.equal(a[key], b[key]) for key in a)
+
+
+@POLICIES
+@pytest.mark.parametrize("switches", [{}, {"policy_kwargs": {"noisy": False, "dueling": False}, "prediction_depth": 0}])
+def test_save_and_load(policy, env, switches, tmp_path):
+    model = make(env(), policy, **switches).learn(60)
+    observations = np.concatenate([model.get_env().reset()]) if policy != "MultiInputPolicy" else model.get_env().reset()
+    actions, _ = model.predict(observations, deterministic=True)
+    model.save(tmp_path / "model.zip")
+    loaded = EqRQRDQN.load(tmp_path / "model.zip", env=env())
+    assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
+    assert np.array_equal(loaded.predict(observations, deterministic=True)[0], actions)
+    a, b = model.policy.optimizer.state_dict(), loaded.policy.optimizer.state_dict()
+    assert a["param_groups"] == b["param_groups"]
+    for key, state in a["state"].items():
+        assert equal_states(state, b["state"][key])
+    loaded.learn(60)  # and on
+    assert EqRQRDQN.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
+
+
+def test_save_and_load_by_file_object():
+    model = make(ChainEnv()).learn(60)
+    file = io.BytesIO()
+    model.save(file)
+    model.save_replay_buffer(buffer := io.BytesIO())
+    file.seek(0)
+    buffer.seek(0)
+    loaded = EqRQRDQN.load(file, env=ChainEnv())
+    assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
+    loaded.load_replay_buffer(buffer)
+    assert loaded.replay_buffer.size() == 60
+
+
+def test_attributes_can_be_left_out_and_put_in(tmp_path):
+    model = make(ChainEnv())
+    model.save(tmp_path / "a", exclude=["learning_rate"])
+    model.custom = 3
+    model.save(tmp_path / "b", exclude=["custom"])
+    assert not hasattr(EqRQRDQN.load(tmp_path / "b"), "custom")
+    model.save(tmp_path / "c")
+    assert EqRQRDQN.load(tmp_path / "c").custom == 3
+
+
+def test_set_env_and_other_numbers_of_environments(tmp_path):
+    model = make(make_vec_env(ChainEnv, 2)).learn(60)
+    model.set_env(make_vec_env(ChainEnv, 2))
+    model.learn(60, reset_num_timesteps=False)
+    model.save(tmp_path / "model")
+    loaded = EqRQRDQN.load(tmp_path / "model", env=make_vec_env(ChainEnv, 3))
+    loaded.learn(60)
+    with pytest.raises(AssertionError, match="number of environments"):
+        loaded.set_env(make_vec_env(ChainEnv, 2))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        EqRQRDQN.load(tmp_path / "model", env=ImageEnv())
+
+
+def test_set_parameters(tmp_path):
+    model, other = make(ChainEnv()).learn(60), make(ChainEnv(), seed=1)
+    assert not equal_states(model.policy.state_dict(), other.policy.state_dict())
+    other.set_parameters(model.get_parameters())
+    assert equal_states(model.policy.state_dict(), other.policy.state_dict())
+    model.save(tmp_path / "model")
+    third = make(ChainEnv(), seed=2)
+    third.set_parameters(str(tmp_path / "model"))
+    assert equal_states(model.policy.state_dict(), third.policy.state_dict())
+
+    parameters = model.get_parameters()
+    missing = deepcopy(parameters)
+    name = next(name for name in missing["policy"] if name.startswith("latent_model.transition"))
+    value = missing["policy"].pop(name)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        other.set_parameters(missing)
+    other.set_parameters(missing, exact_match=False)
+    missing["policy"]["extra"] = value
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        other.set_parameters({**missing, "policy": {**missing["policy"], name: value}})
+    with pytest.raises(ValueError, match="invalid object name"):
+        other.set_parameters({**parameters, "actor": {}})
+    with pytest.raises(ValueError, match="Names of parameters do not match"):
+        other.set_parameters({"policy": parameters["policy"]})
+
+
+@POLICIES
+def test_policies_alone(policy, env, tmp_path):
+    model = make(env(), policy).learn(60)
+    obs = model.get_env().reset()
+    expected = model.predict(obs, deterministic=True)[0]
+    model.policy.save(str(tmp_path / "policy"))
+    loaded = type(model.policy).load(str(tmp_path / "policy"))
+    assert isinstance(loaded, EqRQRDQNPolicy)
+    assert equal_states(model.policy.state_dict(), loaded.state_dict())
+    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], expected)
+    model.quantile_net.save(str(tmp_path / "net"))
+    net = EqRQuantileNetwork.load(str(tmp_path / "net"))
+    assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
+
+
+def test_a_group_of_ones_own_is_saved(tmp_path):
+    group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
+    model = make(ChainEnv(), policy_kwargs={"group": group}).learn(60)
+    model.save(tmp_path / "model")
+    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv()).learn(60)
+    assert str(loaded.policy.latent_model.group) == str(group)
+
+
+def test_replay_buffer_goes_with_the_model(tmp_path):
+    model = make(ChainEnv()).learn(60)
+    model.save_replay_buffer(tmp_path / "buffer")
+    old = model.replay_buffer
+    model.load_replay_buffer(tmp_path / "buffer")
+    for name in ("actions", "rewards", "dones", "timeouts"):
+        assert np.array_equal(getattr(old, name), getattr(model.replay_buffer, name))
+    model.learn(60, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_run_that_was_stopped_is_the_run_that_was_not(normalize, tmp_path):
+    """Saved after 120 of 240 steps, loaded in a new process, continued: the same parameters to the last bit."""
+    model = make(make_env(normalize), buffer_size=200, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p)
+    model.learn(240, callback=Save(tmp_path, at=120))
+    command = [sys.executable, "-m", "tests.resume", str(tmp_path), "120"]
+    subprocess.run(command, check=True, timeout=120)
+    continued = EqRQRDQN.load(tmp_path / "continued", device="cpu")
+    halfway = EqRQRDQN.load(tmp_path / "model", device="cpu")
+    assert continued.num_timesteps == 240 and continued._n_updates == model._n_updates
+    assert equal_states(model.policy.state_dict(), continued.policy.state_dict())
+    assert not equal_states(model.policy.state_dict(), halfway.policy.state_dict())
+    a, b = model.policy.optimizer.state_dict()["state"], continued.policy.optimizer.state_dict()["state"]
+    assert all(equal_states(a[key], b[key]) for key in a)
+
+
+# ---------------------------------------------------------------------------------------------- wrong files
+
+
+def test_a_file_of_another_class(tmp_path):
+    for algorithm in (QRDQN, DQN):
+        algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
+        with pytest.raises(ValueError, match=r"expected a policy derived from EqRQRDQNPolicy, found .*QNPolicy"):
+            EqRQRDQN.load(tmp_path / "stock", env=ChainEnv())
+
+
+def test_parameters_of_another_group(tmp_path):
+    """SE(2) with 4 blocks and GL(2) with 3 have algebras of the same size."""
+    model = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4}, prediction_depth=0)
+    other = make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": 18}, prediction_depth=0)
+    twisted = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4, "parameterization": "exp"}, prediction_depth=0)
+    model.save(tmp_path / "model")
+    for wrong in (other, twisted):
+        before = {name: p.clone() for name, p in wrong.policy.state_dict().items()}
+        with pytest.raises((ValueError, RuntimeError), match=r"SE\(2\)\^4, euler|size mismatch"):
+            wrong.set_parameters(str(tmp_path / "model"))
+        if wrong is other:
+            assert equal_states(before, wrong.policy.state_dict())
+    with pytest.raises(ValueError, match="policy kwargs"):
+        EqRQRDQN.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_checkpoints_cut_off_halfway(share, tmp_path):
+    model = make(ChainEnv()).learn(60)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    for name in ("model.zip", "buffer.pkl"):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(ValueError, match="cut off"):
+        EqRQRDQN.load(tmp_path / "model")
+    buffer = model.replay_buffer
+    with pytest.raises(ValueError, match="cut off"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is buffer
+
+
+def test_replay_buffers_of_others(tmp_path):
+    model = make(ChainEnv()).learn(60)
+    stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
+    stock.save_replay_buffer(tmp_path / "stock")
+    images = make(ImageEnv(), "CnnPolicy")
+    images.save_replay_buffer(tmp_path / "images")
+    for name in ("stock", "images"):
+        with pytest.raises(ValueError, match="expected a replay buffer for"):
+            model.load_replay_buffer(tmp_path / name)
+        assert model.replay_buffer.size() == 60
+
+
+def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    model = make(ChainEnv())
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def break_off(*args, **kwargs):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(th, "save", break_off)
+    monkeypatch.setattr("pickle.dump", break_off)
+    for save in (model.save, model.save_replay_buffer):
+        with pytest.raises(OSError, match="No space"):
+            save(tmp_path / ("model" if save == model.save else "buffer"))
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
