@@ -13,7 +13,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
-from sb3_eqr import EqRQRDQN, MatrixLieGroup
+from sb3_eqr import EqRQRDQN, MatrixLieGroup, SequenceReplayBuffer
 from sb3_eqr.eqr_qrdqn.policies import EqRQRDQNPolicy, EqRQuantileNetwork
 from tests.resume import Save, make_env
 from tests.test_run import make
@@ -67,6 +67,14 @@ def test_attributes_can_be_left_out_and_put_in(tmp_path):
     assert not hasattr(EqRQRDQN.load(tmp_path / "b"), "custom")
     model.save(tmp_path / "c")
     assert EqRQRDQN.load(tmp_path / "c").custom == 3
+
+
+def test_switches_can_be_changed_on_loading(tmp_path):
+    make(ChainEnv()).save(tmp_path / "model")
+    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
+    assert type(loaded.replay_buffer) is SequenceReplayBuffer
+    loaded.learn(60)
+    assert loaded.replay_buffer.n_steps == 5
 
 
 def test_set_env_and_other_numbers_of_environments(tmp_path):

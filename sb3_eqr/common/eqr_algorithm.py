@@ -5,12 +5,13 @@ import pathlib
 import pickle
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -23,6 +24,8 @@ from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.save_util import atomic_write, get_rng_state, is_whole_model, set_rng_state
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
+
+SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
 
 class TDLoss(NamedTuple):
@@ -46,6 +49,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
 
     policy: EqRPolicy
     replay_buffer: SequenceReplayBuffer | None
+    replay_buffer_class: type[SequenceReplayBuffer] | None
     target_update_interval: int | None
     max_grad_norm: float | None
     exploration_schedule: Schedule
@@ -114,12 +118,16 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         self._check_arguments()
         if self.env is not None:
             self.frame_stack = self._find_frame_stack()
+        buffer_class = self.replay_buffer_class or (
+            PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
+        )
         if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
+            self.replay_buffer = self._make_replay_buffer(buffer_class)
         # SB3's set-up rejects n-step Dict replay, knows no target per gradient step and no latent model:
         # it is shown values that it can take, and gets the true ones back.
         shown = {
             "n_steps": 1,
+            "replay_buffer_class": buffer_class,
             "target_update_interval": self.target_update_interval or self.n_envs,
             "policy_kwargs": {**self.policy_kwargs, "latent_model_kwargs": self._latent_model_kwargs()},
         }
@@ -183,15 +191,13 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         found = stack.stacked_obs.n_stack if is_stack else 1  # type: ignore[union-attr]
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
-    def _make_replay_buffer(self) -> SequenceReplayBuffer:
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
+    def _make_replay_buffer(self, buffer_class: type[SequenceReplayBuffer]) -> SequenceReplayBuffer:
         kwargs: dict[str, Any] = {"n_steps": self.n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
-        if issubclass(self.replay_buffer_class, PrioritizedSequenceReplayBuffer):
+        if issubclass(buffer_class, PrioritizedSequenceReplayBuffer):
             kwargs.update(alpha=self.priority_alpha, beta=self.priority_beta)
         kwargs.update(self.replay_buffer_kwargs)
         kwargs["frame_stack"] = self.frame_stack
-        return self.replay_buffer_class(  # type: ignore[return-value]
+        return buffer_class(
             self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
         )
 
@@ -329,7 +335,15 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         self._check_finite("observation", self._last_obs)  # before the first step
         return result
 
-    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:  # type: ignore[override]
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
         # What VecNormalize has clipped may hide an infinity: its originals are looked at.
         normalize = self._vec_normalize_env
         self._check_finite("observation", new_obs if normalize is None else normalize.get_original_obs())
@@ -350,14 +364,15 @@ class EqRAlgorithm(OffPolicyAlgorithm):
                 )
 
     def learn(
-        self,
+        self: SelfEqRAlgorithm,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "EqR",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ):
+    ) -> SelfEqRAlgorithm:
+        """As SB3's ``learn``, with the same parameters."""
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._monitor.collect(self._n_updates)
         return self
@@ -369,7 +384,12 @@ class EqRAlgorithm(OffPolicyAlgorithm):
             self.logger.record(f"train/{name}", value)
         super().dump_logs()
 
-    def save(self, path, exclude=None, include=None) -> None:
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
         """
         As SB3's ``save``, with the state of the random generators, and never by half: the file is written beside and renamed.
 
@@ -386,10 +406,20 @@ class EqRAlgorithm(OffPolicyAlgorithm):
             super().save(file, exclude, include)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path, env=None, device="auto", custom_objects=None, print_system_info=False, force_reset=True, **kwargs):
+    def load(
+        cls: type[SelfEqRAlgorithm],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfEqRAlgorithm:
         """
-        As SB3's ``load``. Where the model has a seed, the random generators are put back to where they were at saving,
-        so that a run goes on as if it had not stopped (pass ``force_reset=False`` and the same environment state).
+        As SB3's ``load``, with the same parameters. Where the model has a seed, the random generators are put back to
+        where they were at saving, so that a run goes on as if it had not stopped (pass ``force_reset=False`` and an
+        environment in the same state).
 
         :raises ValueError: if the file is cut off, or was saved by another class
         """

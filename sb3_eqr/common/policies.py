@@ -1,8 +1,9 @@
 """What every EqR policy adds to an SB3 Q-learning policy."""
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, TypeVar
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -14,6 +15,9 @@ from sb3_eqr.common.features_extractor import ConvExtractor, GroupFeaturesExtrac
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
 from sb3_eqr.common.layers import DistributionalHead
+from sb3_eqr.common.type_aliases import PyTorchObs
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 class EqRNetwork(BasePolicy):
@@ -21,7 +25,7 @@ class EqRNetwork(BasePolicy):
 
     head: DistributionalHead
 
-    def features(self, obs):
+    def features(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: (B, *obs_shape), or a dict of these
         :return: (B, D)
@@ -179,7 +183,7 @@ class EqRPolicy(BasePolicy):
         return data
 
 
-def _frozen_copy(module):
+def _frozen_copy(module: Module) -> Module:
     """A copy in eval mode without trained parameters. Parts that no target needs (r_ψ, ρ) are left out."""
     copy = deepcopy(module)
     if isinstance(copy, LatentModel):

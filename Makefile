@@ -1,0 +1,38 @@
+# `make demo` and `make test` need Python (3.10 or newer) and make, and nothing before them.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+GAME ?= Pong
+STEPS ?=
+
+.PHONY: demo test pytest format lint type commit-checks clean
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: $(VENV)/installed
+	$(BIN)/python examples/demo.py --game "$(GAME)" $(if $(STEPS),--steps $(STEPS))
+
+test: lint type pytest
+
+pytest: $(VENV)/installed
+	$(BIN)/python -m pytest -n 2
+
+format: $(VENV)/installed
+	$(BIN)/ruff check --select I --fix .
+	$(BIN)/ruff format .
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+type: $(VENV)/installed
+	$(BIN)/mypy
+
+commit-checks: format lint type
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

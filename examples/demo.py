@@ -1,0 +1,134 @@
+"""
+EqRQRDQN on one Atari game, from training to a picture.
+
+    python examples/demo.py --game Pong                       # as many steps as fit into --minutes
+    python examples/demo.py --game Boxing --steps 100000      # the real thing
+
+Leaves model.zip, progress.csv and training.png in --out.
+"""
+
+import argparse
+import pathlib
+import time
+
+import matplotlib
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.envs import make_atari100k_env
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import pandas as pd
+
+LOSSES = {
+    "train/td_loss": "TD loss",
+    "train/aet_loss": "AET loss",
+    "train/get_loss": "GET loss",
+    "train/reward_loss": "reward loss",
+}
+EVALUATION_SECONDS = 45  # kept free at the end of the minutes
+
+
+class Demo(BaseCallback):
+    """Writes a row of figures every so many steps, keeps the score of every game, stops when the time is over."""
+
+    def __init__(self, log_every: int, seconds: float | None):
+        super().__init__()
+        self.log_every = log_every
+        self.deadline = None if seconds is None else time.monotonic() + seconds
+        self.scores: list[tuple[int, float]] = []  # (step, raw score of a whole game)
+
+    def _on_step(self) -> bool:
+        self.scores += [(self.num_timesteps, info["episode"]["r"]) for info in self.locals["infos"] if "episode" in info]
+        if self.num_timesteps % self.log_every == 0:
+            self.model.dump_logs()
+        return self.deadline is None or time.monotonic() < self.deadline
+
+
+def steps_that_fit(game: str, seconds: float) -> int:
+    """
+    :return: how many steps a run of so many seconds has here, by the speed of a few updates
+    """
+    model = EqRQRDQN("CnnPolicy", make_atari100k_env(game, seed=0), learning_starts=30, buffer_size=100, seed=0)
+    model.learn(36)  # warm up
+    start = time.monotonic()
+    model.learn(12, reset_num_timesteps=False)
+    per_step = (time.monotonic() - start) / 12
+    start = time.monotonic()
+    model.learning_starts = 200
+    model.learn(100)
+    per_random_step = (time.monotonic() - start) / 100
+    default = 2_000  # random steps at the start, Table 5
+    return default + max(200, int((seconds - default * per_random_step) / per_step))
+
+
+def draw(
+    progress: pd.DataFrame, scores: list[tuple[int, float]], learning_starts: int, title: str, path: pathlib.Path
+) -> None:
+    """One picture: the score of every game and the four losses over steps."""
+    figure, axes = plt.subplots(5, 1, figsize=(7, 11), sharex=True, layout="constrained")
+    figure.suptitle(title)
+    steps, raw = np.array(scores).reshape(-1, 2).T
+    axes[0].plot(steps, raw, "o", color="0.6", markersize=4, label="games in training")
+    if "rollout/ep_rew_mean" in progress:  # not before the first game is over
+        means = progress.dropna(subset="rollout/ep_rew_mean")
+        axes[0].plot(means["time/total_timesteps"], means["rollout/ep_rew_mean"], color="C0", label="mean of the last 100")
+    axes[0].set_ylabel("raw score")
+    axes[0].legend(loc="best", fontsize="small")
+    for axis, (key, name) in zip(axes[1:], LOSSES.items(), strict=True):
+        losses = progress.dropna(subset=key)
+        axis.plot(losses["time/total_timesteps"], losses[key], color="C1")
+        axis.set_ylabel(name)
+        axis.set_ylim(bottom=0)
+    axes[-1].set_xlabel("steps")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+        axis.axvline(learning_starts, color="0.4", linestyle=":")
+    axes[-1].set_xlim(left=0)
+    axes[-1].text(learning_starts, axes[-1].get_ylim()[1], " learning starts", va="top", fontsize="small", color="0.4")
+    beside = path.with_name(f".{path.name}")
+    figure.savefig(beside, dpi=110, format="png")
+    beside.replace(path)
+
+
+def main() -> None:
+    """Train, evaluate, save, draw."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
+    parser.add_argument("--game", default="Pong")
+    parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
+    parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--eval-episodes", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=pathlib.Path)
+    args = parser.parse_args()
+    out = args.out or pathlib.Path("demo_results") / args.game
+    seconds, start = None, time.monotonic()
+    if args.steps is None:
+        seconds = args.minutes * 60 - EVALUATION_SECONDS
+        args.steps = steps_that_fit(args.game, 0.9 * seconds)
+    print(f"{args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
+
+    model = EqRQRDQN("CnnPolicy", make_atari100k_env(args.game, seed=args.seed), seed=args.seed)
+    model.set_logger(configure(str(out), ["csv"]))
+    demo = Demo(max(args.steps // 200, 20), None if seconds is None else seconds - (time.monotonic() - start))
+    checkpoints = CheckpointCallback(10_000, str(out / "checkpoints"), save_replay_buffer=True)
+    model.learn(args.steps, callback=[demo, checkpoints], progress_bar=True)
+    model.dump_logs()
+    model.logger.close()
+    model.save(out / "model")
+
+    env = make_atari100k_env(args.game, n_envs=args.eval_episodes, seed=args.seed + 10_000, training=False)
+    scores, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
+    print(f"score of {len(scores)} games after {model.num_timesteps} steps: mean {np.mean(scores):.1f}, each {scores}")
+    title = f"EqRQRDQN on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
+    draw(pd.read_csv(out / "progress.csv"), demo.scores, model.learning_starts, title, out / "training.png")
+    print(f"{out}/model.zip, {out}/progress.csv, {out}/training.png; {(time.monotonic() - start) / 60:.1f} minutes")
+
+
+if __name__ == "__main__":
+    main()

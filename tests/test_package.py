@@ -1,0 +1,81 @@
+"""What a user gets beside the code: hyperparameter files, examples, the README, the linter's picture of the house."""
+
+import ast
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack
+
+import sb3_eqr
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.envs import make_atari100k_env
+
+ROOT = pathlib.Path(__file__).parent.parent
+ZOO_KEYS = {"policy", "n_timesteps", "frame_stack", "n_envs", "normalize"}  # read by RL Zoo itself
+
+
+def entries():
+    return yaml.safe_load((ROOT / "zoo_hyperparams" / "eqr_qrdqn.yml").read_text())
+
+
+@pytest.mark.parametrize("name", entries())
+def test_every_entry_fits_the_constructor(name):
+    entry = entries()[name]
+    kwargs = {key: value for key, value in entry.items() if key not in ZOO_KEYS}
+    if "policy_kwargs" in kwargs:
+        kwargs["policy_kwargs"] = eval(kwargs["policy_kwargs"])  # as RL Zoo does
+    env = make_atari100k_env("Pong") if name == "atari" else make_vec_env(name)
+    model = EqRQRDQN(entry["policy"], env, device="cpu", **kwargs)
+    for key, value in kwargs.items():
+        found = getattr(model, key)
+        assert (found.frequency if key == "train_freq" else found) == value or key == "policy_kwargs"
+    if name == "atari":
+        assert isinstance(env, VecFrameStack) and env.stacked_obs.n_stack == entry["frame_stack"]
+
+
+def test_the_example_and_the_file_agree():
+    source = (ROOT / "examples" / "cartpole.py").read_text()
+    settings = re.search(r"SETTINGS = (\{.*?\n\})", source, re.S)[1].replace("STEPS", "30_000")
+    entry = entries()["CartPole-v1"]
+    for key, value in ast.literal_eval(re.sub(r"#.*", "", settings)).items():
+        assert (eval(entry[key]) if key == "policy_kwargs" else entry[key]) == value
+
+
+def test_importing_needs_no_extra():
+    code = (
+        "import sys\n"
+        "for name in ('ale_py', 'cv2', 'matplotlib', 'rl_zoo3', 'ray', 'rliable'): sys.modules[name] = None\n"
+        "import sb3_eqr, sb3_eqr.envs\n"
+        "try: sb3_eqr.envs.make_atari100k_env('Pong')\n"
+        "except ImportError as error: assert 'sb3-eqr[atari]' in str(error)\n"
+        "else: raise SystemExit('no error')\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_public_names_and_docstrings():
+    for name in sb3_eqr.__all__:
+        assert getattr(sb3_eqr, name).__doc__
+    assert re.fullmatch(r"\d+\.\d+\.\d+", sb3_eqr.__version__)
+
+
+def test_readme_example_runs(tmp_path, monkeypatch):
+    """The first block of the README, with fewer steps."""
+    monkeypatch.chdir(tmp_path)
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[1]
+    assert "model.learn(100_000, progress_bar=True)" in code
+    exec(code.replace("100_000", "30"), {})
+    assert (tmp_path / "pong.zip").exists()
+
+
+def test_speed_script_prints_its_table(tmp_path):
+    command = [sys.executable, "-m", "sb3_eqr.benchmark.speed", "--threads", "1", "--rounds", "1"]
+    shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
+    rows = [line.split() for line in shown.splitlines() if "QRDQN" in line]
+    assert [row[0] for row in rows] == ["QRDQN", "EqRQRDQN", "EqRQRDQN,"]
+    assert float(rows[1][-1]) <= 8_500 < 56_000 < float(rows[0][-1])
