@@ -99,13 +99,14 @@ def test_same_seed_twice_other_seed_once():
     assert not same_state(a, c)
 
 
-def test_sharing_the_target_pass_changes_no_number():
+def test_sharing_the_target_pass_changes_no_number(monkeypatch):
     """Where the target is a copy of the online networks, one pass serves both: a shortcut, not another algorithm."""
     models = []
     for shortcut in (True, False):
         settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
         assert model._target_is_online
-        model._target_is_online = shortcut
+        monkeypatch.setattr(EqRQRDQN, "_target_is_online", shortcut)
         models.append(model.learn(150))
+        monkeypatch.undo()
     assert same_state(*models)

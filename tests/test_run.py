@@ -76,6 +76,7 @@ def test_every_policy_runs_and_every_part_learns(policy):
         {"policy_kwargs": {"dueling": False}},
         {"policy_kwargs": {"noisy": False}},
         {"policy_kwargs": {"net_arch": [], "shared_projection": False}},
+        {"policy_kwargs": {"net_arch": []}, "aet_coef": 0},
         {"policy_kwargs": {"group": "GL(2)"}},
         {"policy_kwargs": {"group": "SO(3)", "parameterization": "exp"}},
         {"policy_kwargs": {"group": "SE(2)^2 x SO(3)", "n_blocks": None}},

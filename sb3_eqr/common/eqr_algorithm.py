@@ -81,7 +81,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         policy_kwargs = dict(policy_kwargs or {})
         if "optimizer_class" not in policy_kwargs:
             policy_kwargs["optimizer_class"] = th.optim.Adam
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **policy_kwargs.get("optimizer_kwargs", {})}  # Table 5
+            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **(policy_kwargs.get("optimizer_kwargs") or {})}  # Table 5
         super().__init__(
             policy,
             env,
@@ -136,13 +136,20 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         super()._setup_model()
         self.__dict__.update(true)
 
+        if self._uses_aet and self.policy.shared_projection and not self.policy.online.net_arch:
+            raise ValueError(
+                "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
+                'Pass policy_kwargs={"net_arch": [256]} or {"shared_projection": False}, or aet_coef=0.'
+            )
         if self.exploration_final_eps == 0 and not self.policy.noisy:
             warnings.warn(
                 "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
                 "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
             )
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
-        self._target_is_online = self._find_whether_target_is_online()
+        encoder_modules = self.policy.online.features_extractor.modules()
+        depend_on_mode = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
+        self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
         self._monitor = UpdateMonitor(METRICS, self.policy, self.policy.optimizer)
         obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
         obs_spaces = obs_spaces or {"": self.observation_space}
@@ -156,11 +163,13 @@ class EqRAlgorithm(OffPolicyAlgorithm):
                 f"{type(self).__name__}: expected a policy derived from {base.__name__}, found {self.policy_class}. "
                 f"Use one of {list(self.policy_aliases)}; a file is loaded by the class that saved it."
             )
-        if not isinstance(self.prediction_depth, int) or self.prediction_depth < 0:
+        if not isinstance(self.prediction_depth, (int, np.integer)) or self.prediction_depth < 0:
             raise ValueError(f"prediction_depth: expected a whole number of at least 0, found {self.prediction_depth!r}")
         for name in ("aet_coef", "get_coef", "reward_coef", "shift_pixels", "intensity_scale"):
             if not (getattr(self, name) >= 0 and np.isfinite(getattr(self, name))):
                 raise ValueError(f"{name}: expected a finite number of at least 0, found {getattr(self, name)!r}")
+        if not 0 <= self.tau <= 1:
+            raise ValueError(f"tau: expected a number in [0, 1], found {self.tau}")
         if self.depth > 0 and self.batch_size < 2:
             raise ValueError(
                 f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
@@ -176,6 +185,18 @@ class EqRAlgorithm(OffPolicyAlgorithm):
     def depth(self) -> int:
         """M as it is used: 0 where no auxiliary loss is on."""
         return self.prediction_depth if self.aet_coef or self.get_coef or self.reward_coef else 0
+
+    @property
+    def _uses_aet(self) -> bool:
+        return self.depth > 0 and self.aet_coef > 0
+
+    @property
+    def _target_is_online(self) -> bool:
+        """
+        Whether target features are online features: the target is copied after every update, and the encoder does not
+        depend on train mode. Then one pass serves for both.
+        """
+        return self.tau == 1.0 and self.target_update_interval is None and self._encoder_ignores_mode
 
     def _latent_model_kwargs(self) -> dict[str, Any] | None:
         if self.depth == 0:
@@ -200,16 +221,6 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         return buffer_class(
             self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
         )
-
-    def _find_whether_target_is_online(self) -> bool:
-        """
-        Whether target features are online features: the target is copied after every update, and the encoder does not
-        depend on train mode. Then one pass serves for both.
-        """
-        moody = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
-        encoder = self.policy.online.features_extractor
-        copied = self.tau == 1.0 and self.target_update_interval is None
-        return copied and not any(isinstance(module, moody) for module in encoder.modules())
 
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
@@ -277,7 +288,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         features = policy.online.features(observations)  # (B, D)
         with th.no_grad():
             others = [samples.next_observations]
-            if samples.rollout_observations is not None:
+            if samples.rollout_observations is not None and self._uses_aet:
                 others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
             other_observations = self._augment(_cat(others))
             other_features = policy.target.features(other_observations)  # (B + B * M, D)
@@ -288,17 +299,20 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         if samples.mask is None or policy.latent_model is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
-            now = features.detach() if self._target_is_online else policy.target.features(observations)
-            rollout = other_features[batch_size:].unflatten(0, samples.mask.shape)  # (B, M, D)
+            target_states = features.detach() if self._target_is_online else policy.target.features(observations)
+            target_states = target_states[:, None]
+            if self._uses_aet:
+                rollout = other_features[batch_size:].unflatten(0, samples.mask.shape)  # (B, M, D)
+                target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         assert policy.latent_model_target is not None
         auxiliary = policy.latent_model(
             features,
             samples.rollout_actions,
             samples.rollout_rewards,
             samples.mask,
-            th.cat([now[:, None], rollout], dim=1),  # (B, M + 1, D)
+            target_states,
             policy.latent_model_target,
-            policy.project,
+            policy.project if self._uses_aet else None,
             policy.target_project,
         )
         return td, auxiliary
@@ -473,7 +487,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         self.replay_buffer = loaded
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "_target_is_online", "_image_keys"]
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "_encoder_ignores_mode", "_image_keys"]
 
 
 def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:

@@ -3,6 +3,7 @@
 from math import prod
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
@@ -85,7 +86,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         made = make_group(group, parameterization)
         if n_blocks is None:
             n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else DEFAULT_N_BLOCKS
-        if not isinstance(n_blocks, int) or n_blocks < 1:
+        if not isinstance(n_blocks, (int, np.integer)) or n_blocks < 1:
             raise ValueError(f"n_blocks: expected a whole number of at least 1, found {n_blocks!r}")
         super().__init__(observation_space, n_blocks * prod(made.element_shape))
         self.group = made

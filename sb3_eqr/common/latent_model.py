@@ -73,7 +73,7 @@ class LatentModel(nn.Module):
         mask: th.Tensor,
         target_states: th.Tensor,
         target: "LatentModel",
-        project: Projection,
+        project: Projection | None,
         target_project: Projection,
     ) -> LatentLosses:
         """
@@ -83,22 +83,23 @@ class LatentModel(nn.Module):
         :param actions: a_t ... a_{t+M-1}, int64, (B, M)
         :param rewards: r_{t+1} ... r_{t+M}, (B, M)
         :param mask: 1 where the episode had not ended before step t+m, (B, M)
-        :param target_states: x̄₀ ... x̄_M from the target encoder, without gradient, (B, M + 1, D)
+        :param target_states: x̄₀ ... x̄_M from the target encoder, without gradient, (B, M + 1, D);
+            without AET, x̄₀ is enough, (B, 1, D)
         :param target: the target copy of this model, in eval mode, its parameters frozen
-        :param project: p, (..., D) -> (..., P)
+        :param project: p, (..., D) -> (..., P); ``None`` leaves the AET loss out
         :param target_project: p̄
-        :return: three losses, (B,) each; ``None`` for a part that was not built
+        :return: three losses, (B,) each; ``None`` for one that is off
         """
         # Past the end there is no action: a constant one keeps the mask's promise even through batch statistics.
         one_hot = F.one_hot((actions * mask.long()).long(), self.n_actions).to(state.dtype)  # (B, M, A)
         predicted = self.rollout(state, one_hot, mask)  # (B, M, D)
-        with th.no_grad():
-            target_projected = target_project(target_states[:, 1:])  # (B, M, P)
-        aet = (normalized_distance(project(predicted), target_projected) * mask).sum(dim=1)
-        get = None
+        aet = get = reward = None
+        if project is not None:
+            with th.no_grad():
+                target_projected = target_project(target_states[:, 1:])  # (B, M, P)
+            aet = (normalized_distance(project(predicted), target_projected) * mask).sum(dim=1)
         if self.action_symmetry is not None:
             get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
-        reward = None
         if self.reward_net is not None:
             outputs = self.reward_net(predicted.flatten(0, 1)).unflatten(0, mask.shape)  # (B, M, 1 or 3)
             reward = (self._reward_loss(outputs, rewards) * mask).sum(dim=1)

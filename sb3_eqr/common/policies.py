@@ -24,6 +24,7 @@ class EqRNetwork(BasePolicy):
     """A features extractor and a distributional head; what online and target networks have in common."""
 
     head: DistributionalHead
+    net_arch: list[int]
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -51,7 +52,6 @@ class EqRPolicy(BasePolicy):
     def _configure(
         self,
         *,
-        net_arch: list[int],
         group: str | Group | None,
         n_blocks: int | None,
         parameterization: str,
@@ -62,11 +62,6 @@ class EqRPolicy(BasePolicy):
         shared_projection: bool,
         latent_model_kwargs: dict[str, Any] | None,
     ) -> None:
-        if latent_model_kwargs is not None and shared_projection and net_arch == []:
-            raise ValueError(
-                "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
-                "Pass net_arch=[256], or shared_projection=False, or switch the auxiliary losses off (prediction_depth=0)."
-            )
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization

@@ -137,7 +137,6 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     ):
         net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
         self._configure(
-            net_arch=net_arch,
             group=group,
             n_blocks=n_blocks,
             parameterization=parameterization,
