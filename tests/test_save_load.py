@@ -183,10 +183,9 @@ def test_parameters_of_another_group(tmp_path):
     model.save(tmp_path / "model")
     for wrong in (other, twisted):
         before = {name: p.clone() for name, p in wrong.policy.state_dict().items()}
-        with pytest.raises((ValueError, RuntimeError), match=r"SE\(2\)\^4, euler|size mismatch"):
+        with pytest.raises(ValueError, match=r"expected parameters of .*, found parameters of 'SE\(2\)\^4, euler'"):
             wrong.set_parameters(str(tmp_path / "model"))
-        if wrong is other:
-            assert equal_states(before, wrong.policy.state_dict())
+        assert equal_states(before, wrong.policy.state_dict())
     with pytest.raises(ValueError, match="policy kwargs"):
         EqRQRDQN.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
 
