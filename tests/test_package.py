@@ -55,7 +55,7 @@ def test_importing_needs_no_extra():
         "except ImportError as error: assert 'sb3-eqr[atari]' in str(error)\n"
         "else: raise SystemExit('no error')\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
 def test_public_names_and_docstrings():

@@ -162,7 +162,7 @@ def test_images_channels_first_and_last(shape):
 def test_images_that_are_floats_already():
     env = ImageEnv((3, 40, 36), dtype=np.float32)
     model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(60)
-    assert model._image_keys == [""]  # augmented like the others
+    assert model._augment.image_keys == [""]  # augmented like the others
     with pytest.raises(ValueError, match="normalize_images=False"):
         make(env, "CnnPolicy")
     with pytest.raises(ValueError, match="MlpPolicy for vectors"):
@@ -235,7 +235,7 @@ def test_multi_discrete_and_multi_binary_observations(space):
 
 def test_dict_observations_are_augmented_where_they_are_images():
     model = make(SimpleMultiObsEnv(channel_last=True), "MultiInputPolicy")
-    assert model._image_keys == ["img"]
+    assert model._augment.image_keys == ["img"]
     model.learn(60)
     obs = {"img": th.randint(0, 256, (4, 1, 36, 36), dtype=th.uint8), "vec": th.rand(4, 5)}
     augmented = model._augment(obs)

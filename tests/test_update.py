@@ -124,8 +124,8 @@ def test_one_features_pass_serves_both(monkeypatch):
 def test_online_and_target_observations_are_augmented(monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(60)
     seen = []
-    augment = type(model)._augment_images
-    monkeypatch.setattr(type(model), "_augment_images", lambda self, x: seen.append(len(x)) or augment(self, x))
+    augment = model._augment.images
+    monkeypatch.setattr(model._augment, "images", lambda x: seen.append(len(x)) or augment(x))
     model.train(1, 8)
     assert seen == [8, 24]
 

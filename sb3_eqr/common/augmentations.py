@@ -2,6 +2,8 @@
 
 import torch as th
 
+from sb3_eqr.common.type_aliases import PyTorchObs
+
 
 def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
     """
@@ -33,3 +35,36 @@ def random_intensity(images: th.Tensor, scale: float) -> th.Tensor:
     # One pass makes them floats in the layout that the convolutions want, so that none has to copy them again.
     images = images.to(dtype, memory_format=th.channels_last, copy=True)
     return images.mul_(1.0 + scale * noise)
+
+
+class ImageAugmentation:
+    """
+    Shift, then intensity, on those parts of an observation that are images.
+
+    :param image_keys: keys of a dict observation that are images; for a plain observation, any key says that it is one
+    :param shift_pixels: ≥ 0, 0 switches the shift off
+    :param intensity_scale: ≥ 0, 0 switches the intensity off
+    """
+
+    def __init__(self, image_keys: list[str], shift_pixels: int, intensity_scale: float):
+        self.image_keys = image_keys
+        self.shift_pixels = shift_pixels
+        self.intensity_scale = intensity_scale
+
+    def __call__(self, observations: PyTorchObs) -> PyTorchObs:
+        """
+        :param observations: (B, *obs_shape), images (B, C, H, W), or a dict of these
+        :return: the same shapes; images are floats unless the intensity is off
+        """
+        if isinstance(observations, dict):
+            return {key: self.images(obs) if key in self.image_keys else obs for key, obs in observations.items()}
+        return self.images(observations) if self.image_keys else observations
+
+    def images(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: (B, C, H, W)
+        :return: (B, C, H, W)
+        """
+        if self.shift_pixels > 0:
+            images = random_shift(images, self.shift_pixels)
+        return random_intensity(images, self.intensity_scale) if self.intensity_scale > 0 else images

@@ -2,7 +2,6 @@
 
 import io
 import pathlib
-import pickle
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -18,12 +17,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 
-from sb3_eqr.common.augmentations import random_intensity, random_shift
+from sb3_eqr.common.augmentations import ImageAugmentation
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.save_util import atomic_write, get_rng_state, is_whole_model, set_rng_state
+from sb3_eqr.common.safe_files import SafeFiles
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
-from sb3_eqr.common.update_monitor import UpdateMonitor
+from sb3_eqr.common.update_monitor import UpdateMonitor, check_finite
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
@@ -39,7 +38,7 @@ class TDLoss(NamedTuple):
 METRICS = ("td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value")
 
 
-class EqRAlgorithm(OffPolicyAlgorithm):
+class EqRAlgorithm(SafeFiles):
     """
     Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
     one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
@@ -47,6 +46,7 @@ class EqRAlgorithm(OffPolicyAlgorithm):
     For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
     """
 
+    replay_buffer_base = SequenceReplayBuffer
     policy: EqRPolicy
     replay_buffer: SequenceReplayBuffer | None
     replay_buffer_class: type[SequenceReplayBuffer] | None
@@ -154,7 +154,8 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
         obs_spaces = obs_spaces or {"": self.observation_space}
         float_images = not self.policy.normalize_images
-        self._image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
+        image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
+        self._augment = ImageAugmentation(image_keys, self.shift_pixels, self.intensity_scale)
 
     def _check_arguments(self) -> None:
         base = self.policy_aliases["MlpPolicy"]
@@ -334,19 +335,9 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         :param next_target: the same from the target, (B, D)
         """
 
-    def _augment(self, observations: PyTorchObs) -> PyTorchObs:
-        if isinstance(observations, dict):
-            return {key: self._augment_images(obs) if key in self._image_keys else obs for key, obs in observations.items()}
-        return self._augment_images(observations) if self._image_keys else observations
-
-    def _augment_images(self, images: th.Tensor) -> th.Tensor:
-        if self.shift_pixels > 0:
-            images = random_shift(images, self.shift_pixels)
-        return random_intensity(images, self.intensity_scale) if self.intensity_scale > 0 else images
-
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
-        self._check_finite("observation", self._last_obs)  # before the first step
+        check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
         return result
 
     def _store_transition(
@@ -360,22 +351,13 @@ class EqRAlgorithm(OffPolicyAlgorithm):
     ) -> None:
         # What VecNormalize has clipped may hide an infinity: its originals are looked at.
         normalize = self._vec_normalize_env
-        self._check_finite("observation", new_obs if normalize is None else normalize.get_original_obs())
-        self._check_finite("reward", reward if normalize is None else normalize.get_original_reward())
+        step = self.num_timesteps
+        check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
+        check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
         for info in infos:
             if info.get("terminal_observation") is not None:
-                self._check_finite("terminal observation", info["terminal_observation"])
+                check_finite("terminal observation", info["terminal_observation"], step)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-
-    def _check_finite(self, what: str, values: Any) -> None:
-        for key, array in values.items() if isinstance(values, dict) else [("", values)]:
-            if np.issubdtype(np.asarray(array).dtype, np.floating) and not np.isfinite(array).all():
-                found = np.asarray(array)[~np.isfinite(array)].flat[0]
-                raise ValueError(
-                    f"step {self.num_timesteps}: expected finite {what}s from the environment, found {found} in the {what}"
-                    f"{' ' + repr(key) if key else ''}. It was not stored and the model is as before. Mend the environment; "
-                    "SB3's VecCheckNan tells which action led there."
-                )
 
     def learn(
         self: SelfEqRAlgorithm,
@@ -405,89 +387,17 @@ class EqRAlgorithm(OffPolicyAlgorithm):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        As SB3's ``save``, with the state of the random generators, and never by half: the file is written beside and renamed.
+        As SB3's ``save``, see :meth:`SafeFiles.save`. A model whose last update went wrong is put back and not saved.
 
         :param path: path to the file, or a file-like
         :param exclude: names of attributes to leave out beside the default ones
         :param include: names of attributes to save although they are left out by default
         """
         self._monitor.collect(self._n_updates)
-        self.rng_state = get_rng_state(self.action_space)
-        if not isinstance(path, (str, pathlib.Path)):
-            super().save(path, exclude, include)
-            return
-        with atomic_write(path, "zip") as file:
-            super().save(file, exclude, include)  # type: ignore[arg-type]
-
-    @classmethod
-    def load(
-        cls: type[SelfEqRAlgorithm],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfEqRAlgorithm:
-        """
-        As SB3's ``load``, with the same parameters. Where the model has a seed, the random generators are put back to
-        where they were at saving, so that a run goes on as if it had not stopped (pass ``force_reset=False`` and an
-        environment in the same state).
-
-        :raises ValueError: if the file is cut off, or was saved by another class
-        """
-        if isinstance(path, (str, pathlib.Path)):
-            found = next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
-            if found is not None and not is_whole_model(found):
-                raise ValueError(
-                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or something else. "
-                    "Load an earlier checkpoint."
-                )
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        if model.seed is not None and getattr(model, "rng_state", None) is not None:
-            set_rng_state(model.rng_state, model.action_space)
-        return model
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """
-        As SB3's, but never by half: the file is written beside and renamed.
-
-        :param path: path to the file, or a file-like
-        """
-        if not isinstance(path, (str, pathlib.Path)):
-            super().save_replay_buffer(path)
-            return
-        with atomic_write(path, "pkl") as file:
-            super().save_replay_buffer(file)  # type: ignore[arg-type]
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        As SB3's.
-
-        :param path: path to the file, or a file-like
-        :param truncate_last_traj: has no effect here
-        :raises ValueError: if the file is cut off, or holds a buffer for other observations, actions or environments;
-            the model then keeps the buffer it had
-        """
-        before = self.replay_buffer
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-        except (EOFError, pickle.UnpicklingError, AssertionError) as error:
-            self.replay_buffer = before
-            raise ValueError(
-                f"{path}: expected a whole replay buffer saved by {type(self).__name__}.save_replay_buffer, "
-                f"found one that is cut off or something else ({error}). Load an earlier one."
-            ) from error
-        loaded, self.replay_buffer = self.replay_buffer, before
-        expected = (SequenceReplayBuffer, self.observation_space, self.action_space, self.n_envs)
-        found = (type(loaded), loaded.observation_space, loaded.action_space, loaded.n_envs)  # type: ignore[union-attr]
-        if not isinstance(loaded, SequenceReplayBuffer) or expected[1:] != found[1:]:
-            raise ValueError(f"{path}: expected a replay buffer for {expected}, found {found}. Load the one of this model.")
-        self.replay_buffer = loaded
+        super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "_encoder_ignores_mode", "_image_keys"]
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "_encoder_ignores_mode", "_augment"]
 
 
 def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:

@@ -1,4 +1,4 @@
-"""The figures of each update, read when they are asked for, and the way back from an update that went wrong."""
+"""Numbers that are not finite: refused where they come in, undone where they come out of an update."""
 
 from collections.abc import Iterator
 
@@ -7,8 +7,27 @@ import torch as th
 from torch import nn
 
 
+def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
+    """
+    :param what: the name of the values, for the message
+    :param values: from the environment; integers are always finite
+    :param step: number of environment steps so far, for the message
+    :raises ValueError: if one is NaN or infinite
+    """
+    for key, array in values.items() if isinstance(values, dict) else [("", values)]:
+        array = np.asarray(array)
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise ValueError(
+                f"step {step}: expected finite {what}s from the environment, found {array[~np.isfinite(array)].flat[0]} "
+                f"in the {what}{f' {key!r}' if key else ''}. It was not stored and the model is as before. "
+                "Mend the environment; SB3's VecCheckNan tells which action led there."
+            )
+
+
 class UpdateMonitor:
     """
+    The figures of each update, read when they are asked for, and the way back from an update that went wrong.
+
     Figures stay on the device until the next round of updates, when they are long computed: no update waits for them.
     One that is not finite puts model and optimiser back to where the round began.
 
