@@ -209,6 +209,8 @@ def test_n_and_gamma_are_read_at_sampling_time(buffer_class):
             assert expected is not None
             np.testing.assert_allclose(samples.rewards[b], expected["rewards"], rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(samples.discounts[b], expected["discounts"], rtol=1e-6)
+        stream.feed(3, buffer)  # between two samples, too
+        samples = buffer.sample(4000)
         # The ring's newest is at 19: the starts are the positions of age max(n, M) - 1 and above.
         assert len(set(samples.indices)) == 50 - max(n_steps, 2) + 1
 
@@ -304,6 +306,22 @@ def test_memory_does_not_grow_once_the_ring_is_full():
     before = buffer.nbytes
     stream.feed(900, buffer)
     assert buffer.nbytes <= before * 1.15
+
+
+@pytest.mark.parametrize("n_adds", [7, 95])
+def test_a_reset_buffer_is_a_new_one(n_adds):
+    settings = (40, IMAGES, ACTIONS, "cpu", 2)
+    kwargs = {"n_steps": 2, "prediction_depth": 3, "frame_stack": 4}
+    used, new = (PrioritizedSequenceReplayBuffer(*settings, **kwargs) for _ in range(2))
+    Stream(IMAGES, 2, seed=1).feed(n_adds, used)
+    used.reset()
+    Stream(IMAGES, 2, mean_length=3).feed(10, used, new)
+    np.random.seed(0)
+    a = used.sample(100)
+    np.random.seed(0)
+    b = new.sample(100)
+    assert np.array_equal(a.indices, b.indices) and th.equal(a.rollout_observations, b.rollout_observations)
+    assert used.nbytes == new.nbytes
 
 
 @pytest.mark.parametrize("n_adds", [7, 95])
@@ -404,8 +422,8 @@ class TestPriorities:
     "kwargs, message",
     [
         ({"buffer_size": 8}, "n_steps \\+ prediction_depth \\+ 1 = 9"),
-        ({"n_steps": 0}, "n_steps: expected at least 1, found 0"),
-        ({"prediction_depth": -1}, "prediction_depth: expected at least 0, found -1"),
+        ({"n_steps": 0}, "n_steps: expected a whole number of at least 1, found 0"),
+        ({"prediction_depth": -1}, "prediction_depth: expected a whole number of at least 0, found -1"),
         ({"gamma": 1.5}, "gamma"),
         ({"frame_stack": 3}, "frame_stack: expected a divisor"),
         ({"frame_stack": 0}, "frame_stack: expected a divisor"),

@@ -5,8 +5,9 @@ import pytest
 import torch as th
 from sb3_contrib.qrdqn.policies import QRDQNPolicy
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_eqr import EqRQRDQN
 from tests.test_run import SMALL, make
@@ -26,7 +27,20 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"policy_kwargs": {"group": "none"}}, "Pass get_coef=0"),
         ({"prediction_depth": -1}, "prediction_depth: expected a whole number of at least 0, found -1"),
         ({"prediction_depth": 1.5}, "prediction_depth"),
-        ({"tau": 1.5}, "tau: expected a number in \\[0, 1\\], found 1.5"),
+        ({"shift_pixels": 2.5}, "shift_pixels: expected a whole number"),
+        ({"n_steps": 3.0}, "n_steps: expected a whole number"),
+        ({"batch_size": 32.0}, "batch_size: expected a whole number"),
+        ({"aet_coef": None}, "aet_coef: expected a finite number"),
+        ({"tau": None}, "tau: expected a finite number"),
+        ({"priority_alpha": float("nan")}, "alpha"),
+        ({"policy_kwargs": {"n_quantiles": 0}}, "n_quantiles: expected a whole number of at least 1"),
+        ({"policy_kwargs": {"latent_hidden_dim": 0}}, "latent_hidden_dim: expected a whole number of at least 1"),
+        ({"policy_kwargs": {"group": 2}}, "expected GL\\(n\\), SE\\(n\\).*found 2"),
+        ({"policy_kwargs": {"group": None}}, "Pass get_coef=0"),
+        ({"replay_buffer_class": "x"}, "expected SequenceReplayBuffer"),
+        ({"replay_buffer_kwargs": {"n_steps": 1}}, "Pass n_steps=1 to EqRQRDQN"),
+        ({"replay_buffer_kwargs": {"alpha": 0.7}}, "Pass priority_alpha=0.7 to EqRQRDQN"),
+        ({"tau": 1.5}, "tau: expected a finite number in \\[0, 1\\], found 1.5"),
         ({"aet_coef": -1.0}, "aet_coef: expected a finite number of at least 0"),
         ({"reward_coef": float("nan")}, "reward_coef"),
         ({"shift_pixels": -4}, "shift_pixels"),
@@ -75,6 +89,10 @@ def test_bad_values_from_the_environment(where, what, value, normalize):
     with pytest.raises(ValueError, match=f"step 60: expected finite .*{what}s? from the environment, found (nan|-?inf)"):
         model.learn(100)
     assert model.replay_buffer.size() == 59 and model._n_updates > 0
+    if normalize:
+        return  # its own running statistics are spoilt by now
+    model.learn(5, reset_num_timesteps=False)  # resets the environment: no transition spans the gap
+    assert model.replay_buffer.timeouts[58].all() or model.replay_buffer.dones[58].all()
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
@@ -87,18 +105,21 @@ def test_a_bad_first_observation_is_refused_before_the_first_step():
 
 @pytest.mark.parametrize("trained", [0, 5])
 def test_losses_that_are_not_finite_leave_the_last_good_model(trained, tmp_path):
-    model = make(ChainEnv()).learn(41 + trained)
+    """The first loss of a round tells on the round before: the model goes back to where that one began."""
+    model = make(ChainEnv()).learn(40 + trained)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    slots = len(model.policy.optimizer.state)
+    slots, updates = len(model.policy.optimizer.state), model._n_updates
+    model.learn(1, reset_num_timesteps=False)
+    assert model._n_updates == updates + 2
     model.replay_buffer.rewards[:] = 1e38  # finite, but not its square
     model.train(gradient_steps=2, batch_size=8)
     assert not all(th.isfinite(p).all() for p in model.policy.parameters())
-    update = model._n_updates - 1
-    with pytest.raises(FloatingPointError, match=f"update {update}: expected finite losses, found .*reward_loss = inf"):
+    message = f"update {updates + 3}: expected finite losses, found .*reward_loss = inf.* put back to update {updates} "
+    with pytest.raises(FloatingPointError, match=message):
         model.save(tmp_path / "model")
     after = model.policy.state_dict()
     assert all(th.equal(good[name], after[name]) for name in good)
-    assert len(model.policy.optimizer.state) == slots
+    assert len(model.policy.optimizer.state) == slots and model._n_updates == updates
     states = [value for state in model.policy.optimizer.state.values() for value in state.values()]
     assert all(th.isfinite(value).all() for value in states)
     assert list(tmp_path.iterdir()) == []
@@ -120,11 +141,46 @@ def test_the_very_first_update_may_be_the_bad_one():
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-def test_learning_stops_at_a_bad_update():
-    model = make(ChainEnv(), learning_rate=1e30)
+@pytest.mark.parametrize("gradient_steps", [1, 2, 3])
+@pytest.mark.parametrize("good_rounds", [0, 1, 4])
+def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(gradient_steps, good_rounds):
+    """The losses of an update do not show what its own step has done: the next round's do."""
+    model = make(ChainEnv(), gradient_steps=gradient_steps, learning_starts=40)
+    sizes = []
+
+    class Callback(BaseCallback):
+        def _on_step(self):
+            rounds = model._n_updates // gradient_steps
+            if rounds == good_rounds and not sizes:
+                sizes.append(model._n_updates)
+                model.lr_schedule = lambda progress: 1e30
+            return True
+
     with pytest.raises(FloatingPointError, match="Lower learning_rate"):
-        model.learn(200)
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+        model.learn(200, callback=Callback())
+    assert model._n_updates == sizes[0] == good_rounds * gradient_steps
+    assert max(p.abs().max().item() for p in model.policy.parameters()) < 100
+    td, auxiliary = model._compute_losses(model.replay_buffer.sample(8))
+    assert all(th.isfinite(loss).all() for loss in (td.loss, *auxiliary))
+    model.lr_schedule = lambda progress: 1e-4
+    model.learn(50, reset_num_timesteps=False)
+
+
+def test_moving_n_beyond_the_buffer_is_refused():
+    model = make(ChainEnv(), buffer_size=50).learn(60)
+    model.n_steps = 60
+    with pytest.raises(ValueError, match="n_steps \\+ prediction_depth \\+ 1 = 63"):
+        model.train(1, 8)
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_vec_normalize_inside_a_wrapper_that_changes_observations(stacked):
+    env = make_vec_env(ImageEnv)
+    wrong = VecNormalize(VecFrameStack(env, 2) if stacked else env, norm_obs=False)
+    with pytest.raises(ValueError, match="Use VecNormalize\\(VecTransposeImage\\(env\\)\\)"):
+        make(wrong, "CnnPolicy")
+    right = VecNormalize(VecTransposeImage(VecFrameStack(env, 2) if stacked else env), norm_obs=False)
+    assert make(right, "CnnPolicy").learn(60)._n_updates > 0
 
 
 def test_greedy_exploration_is_warned_of():

@@ -209,12 +209,13 @@ def test_the_group_action_between_states_carries_no_gradient():
     gradient, d GET / da would be 0. Held fixed, GET = 2 − 2 cos(δ + a − a₀) with δ = −ρ, so d GET / da = −2 sin ρ.
     """
     model = LatentModel(make_group("SO(2)"), 1, 2).double()
-    model.transition, model.projection, model.reward_net = Constant(0.3), nn.Identity(), None
+    model.transition, model.projection = Constant(0.3), nn.Identity()
     model.action_symmetry = Constant(0.9)
     angles = th.tensor([[0.2], [1.5], [-0.8]], dtype=th.float64, requires_grad=True)
     state = model.group.element(angles).flatten(1)
     targets = rotation(np.zeros((3, 2)))
-    losses = model(state, th.zeros(3, 1).long(), th.zeros(3, 1), th.ones(3, 1), targets, model, identity, identity)
+    losses = model(state, th.zeros(3, 1).long(), None, th.ones(3, 1), targets, model, None, identity)
+    assert losses.aet is None and losses.reward is None
     losses.get.sum().backward()
     np.testing.assert_allclose(angles.grad, np.full((3, 1), -2 * np.sin(0.9)), atol=1e-12)
 
@@ -246,14 +247,22 @@ def test_a_singular_state_neither_stops_nor_poisons():
     assert th.isfinite(state.grad).all() and all(th.isfinite(loss).all() for loss in losses)
 
 
-def test_parts_that_are_off_are_not_built():
-    model = LatentModel(make_group("SE(2)"), 2, 3, reward_loss=None, with_symmetry=False)
-    assert {name.split(".")[0] for name, _ in model.named_parameters()} == {"transition"}
+def test_what_is_absent_is_off():
+    model, case = random_case()
+    th.manual_seed(0)
+    full = model.eval()(**case)
+    for name, absent in (("aet", "project"), ("get", "target"), ("reward", "rewards")):
+        th.manual_seed(0)
+        losses = model(**{**case, absent: None})
+        for field in losses._fields:
+            found = getattr(losses, field)
+            assert found is None if field == name else th.equal(found, getattr(full, field))
     with pytest.raises(ValueError, match=r"\['mse', 'categorical'\]"):
         LatentModel(make_group("SE(2)"), 2, 3, reward_loss="huber")
-    with pytest.raises(ValueError, match="get_coef=0"):
-        LatentModel(make_group("none"), 1, 3)
-    free = LatentModel(make_group("none(6)"), 1, 3, with_symmetry=False)
+
+
+def test_without_a_group_the_network_predicts_the_next_state():
+    free = LatentModel(make_group("none(6)"), 1, 3).eval()
     one_hot = th.eye(3)
-    expected = free.eval().transition(th.cat([th.ones(3, 6), one_hot], dim=1))
+    expected = free.transition(th.cat([th.ones(3, 6), one_hot], dim=1))
     assert th.equal(free.rollout(th.ones(3, 6), one_hot[:, None], th.ones(3, 1))[:, 0], expected)

@@ -28,6 +28,7 @@ from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
 from sb3_eqr.common.eqr_algorithm import METRICS
+from sb3_eqr.common.features_extractor import ConvExtractor
 from tests.toys import ChainEnv, ImageEnv
 
 SMALL = {
@@ -159,10 +160,22 @@ def test_images_channels_first_and_last(shape):
     assert model.predict(first[None], deterministic=True)[0].tolist() == [action]
 
 
+def test_group_keywords_reach_a_given_group_encoder():
+    own = {"features_extractor_class": GroupFeaturesExtractor, "group": "SO(3)", "n_blocks": 2}
+    encoder = make(ChainEnv(), policy_kwargs=own).quantile_net.features_extractor
+    assert (str(encoder.group), encoder.n_blocks) == ("SO(3)", 2)
+    own["features_extractor_kwargs"] = {"group": "T(2)"}
+    assert str(make(ChainEnv(), policy_kwargs=own).quantile_net.features_extractor.group) == "T(2)"
+    assert make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": None}).policy.latent_model.n_blocks == 32  # Table 5
+
+
 def test_images_that_are_floats_already():
     env = ImageEnv((3, 40, 36), dtype=np.float32)
     model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(60)
     assert model._augment.image_keys == [""]  # augmented like the others
+    policy_kwargs = {"normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
+    encoder = make(env, "CnnPolicy", policy_kwargs=policy_kwargs).quantile_net.features_extractor
+    assert isinstance(encoder.trunk, ConvExtractor)
     with pytest.raises(ValueError, match="normalize_images=False"):
         make(env, "CnnPolicy")
     with pytest.raises(ValueError, match="MlpPolicy for vectors"):
@@ -250,6 +263,8 @@ def test_frame_stacks_are_found_and_stored_once():
     assert model.frame_stack == 4 and model.replay_buffer.nbytes / 400 < 1.3 * 36 * 36
     whole = make(env, "CnnPolicy", buffer_size=400, replay_buffer_kwargs={"frame_stack": 1}).learn(100)
     assert whole.frame_stack == 1
+    sideways = VecFrameStack(make_vec_env(lambda: ImageEnv((1, 40, 36))), 2, channels_order="last")
+    assert make(sideways, "CnnPolicy").frame_stack == 1  # frames lie side by side along the width
     np.random.seed(0)
     a = model.replay_buffer.sample(200)
     np.random.seed(0)
@@ -428,11 +443,27 @@ def test_logger_has_every_key_and_reads_only_when_dumped(tmp_path, monkeypatch):
 def test_logged_figures_are_means_over_the_updates_since_the_last_dump():
     model = make(ChainEnv())
     model.set_logger(configure(None, []))
-    for value in (1.0, 3.0):
-        model._monitor.add([th.tensor(value + k) for k in range(len(METRICS))])
-    model._monitor.collect(2)
-    assert model._monitor.means() == {name: 2.0 + k for k, name in enumerate(METRICS)}
-    assert model._monitor.means() == {}
+    for values in ((1.0, 3.0), (5.0, 7.0)):
+        model._monitor.start_round(0)
+        for value in values:
+            model._monitor.add([th.tensor(value + k) for k in range(len(METRICS))])
+        model._collect_metrics()
+    logged = model.logger.name_to_value
+    assert {name: logged[f"train/{name}"] for name in METRICS} == {name: 4.0 + k for k, name in enumerate(METRICS)}
+    model.logger.dump()
+    model._collect_metrics()
+    assert not any("train/" in key for key in model.logger.name_to_value)
+
+
+def test_losses_are_seen_by_callbacks_that_dump_themselves(tmp_path):
+    """EvalCallback calls logger.dump: what training has recorded by then goes with it, as with QRDQN."""
+    model = make(ChainEnv())
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(
+        100, callback=EvalCallback(make_vec_env(ChainEnv), eval_freq=30, n_eval_episodes=1, verbose=0), log_interval=None
+    )
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
+    assert {"train/td_loss", "train/loss", "eval/mean_reward"} <= set(header)
 
 
 def test_tensorboard(tmp_path):

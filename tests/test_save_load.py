@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
@@ -59,6 +60,15 @@ def test_save_and_load_by_file_object():
     assert loaded.replay_buffer.size() == 60
 
 
+def test_checkpoints_made_in_the_middle_of_a_step_go_on(tmp_path):
+    make(ChainEnv()).learn(120, callback=CheckpointCallback(50, str(tmp_path), save_replay_buffer=True))
+    model = EqRQRDQN.load(tmp_path / "rl_model_100_steps", env=ChainEnv())
+    model.load_replay_buffer(tmp_path / "rl_model_replay_buffer_100_steps")
+    model.learn(50, reset_num_timesteps=False)
+    assert model.num_timesteps == 150 and model.replay_buffer.size() == 99 + 50
+    assert model.replay_buffer.timeouts[98, 0] or model.replay_buffer.dones[98, 0]  # the episode was cut there
+
+
 def test_attributes_can_be_left_out_and_put_in(tmp_path):
     model = make(ChainEnv())
     model.save(tmp_path / "a", exclude=["learning_rate"])
@@ -75,6 +85,30 @@ def test_switches_can_be_changed_on_loading(tmp_path):
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
     loaded.learn(60)
     assert loaded.replay_buffer.n_steps == 5
+    for change in ({"get_coef": 0.0}, {"reward_coef": 0.0}, {"prediction_depth": 0}, {"aet_coef": 0.0, "double_q": False}):
+        EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
+    make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
+    richer = EqRQRDQN.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)
+    assert richer._compute_losses(richer.replay_buffer.sample(8))[1].aet.shape == (8,)
+
+
+def test_another_seed_may_be_given_on_loading(tmp_path):
+    make(ChainEnv(), seed=0).learn(50).save(tmp_path / "model")
+    draws = []
+    for kwargs in ({}, {}, {"seed": 1}, {"seed": 2}):
+        EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), **kwargs)
+        draws.append((np.random.random(), th.rand(1).item()))
+    assert draws[0] == draws[1] and len(set(draws)) == 3
+
+
+def test_a_target_that_is_no_copy_is_not_taken_for_one(tmp_path):
+    model = make(ChainEnv(), tau=0.005).learn(60)
+    assert not model._target_is_online
+    model.save(tmp_path / "model")
+    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), tau=1.0)
+    assert not loaded._target_is_online
+    loaded.learn(60)
+    assert loaded._target_is_online
 
 
 def test_set_env_and_other_numbers_of_environments(tmp_path):
@@ -213,9 +247,13 @@ def test_replay_buffers_of_others(tmp_path):
     images = make(ImageEnv(), "CnnPolicy")
     images.save_replay_buffer(tmp_path / "images")
     for name in ("stock", "images"):
-        with pytest.raises(ValueError, match="expected a replay buffer for"):
+        with pytest.raises(ValueError, match="expected a replay buffer of"):
             model.load_replay_buffer(tmp_path / name)
         assert model.replay_buffer.size() == 60
+    for other in ({"prioritized_replay": False}, {"priority_alpha": 0.9}):
+        make(ChainEnv(), **other).save_replay_buffer(tmp_path / "other")
+        with pytest.raises(ValueError, match="expected a replay buffer of"):
+            model.load_replay_buffer(tmp_path / "other")
 
 
 def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.frame_store import FrameStore
 from sb3_eqr.common.sum_tree import SumTree
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -90,12 +91,9 @@ class SequenceReplayBuffer(ReplayBuffer):
             )
 
     def _check_arguments(self, frame_stack: int) -> None:
-        if self.n_steps < 1:
-            raise ValueError(f"n_steps: expected at least 1, found {self.n_steps}")
-        if self.prediction_depth < 0:
-            raise ValueError(f"prediction_depth: expected at least 0, found {self.prediction_depth}")
-        if not 0 <= self.gamma <= 1:
-            raise ValueError(f"gamma: expected a number in [0, 1], found {self.gamma}")
+        check_number("n_steps", self.n_steps, 1, whole=True)
+        check_number("prediction_depth", self.prediction_depth, 0, whole=True)
+        check_number("gamma", self.gamma, 0, 1)
         needed = self.n_steps + self.prediction_depth + 1
         if self.buffer_size < needed:
             raise ValueError(
@@ -121,7 +119,12 @@ class SequenceReplayBuffer(ReplayBuffer):
         return max(self.n_steps, self.prediction_depth)
 
     def can_sample(self) -> bool:
-        """Whether there is a start to draw."""
+        """
+        Whether there is a start to draw.
+
+        :raises ValueError: if ``n_steps`` or ``prediction_depth`` has been moved beyond what the buffer can hold
+        """
+        self._check_arguments(frame_stack=1)
         return self.size() >= (self.window if self.prediction_depth > 0 else 1)
 
     def add(  # type: ignore[override]
@@ -146,8 +149,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         follows = np.ones(self.n_envs, dtype=bool)
         for key, store in self._stores.items():
             now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
-            shape = (self.n_envs, *store.obs_shape)
-            follows &= store.add(self.pos, now.reshape(shape), then.reshape(shape), overwrite=self.full)
+            follows &= store.add(self.pos, self._shaped(now, store), self._shaped(then, store), overwrite=self.full)
         # An environment that was reset in the middle of an episode (a second call of learn) cuts it like a time-out.
         self.timeouts[self.pos - 1, ~follows & ~self._episode_starts] = 1.0
 
@@ -162,6 +164,23 @@ class SequenceReplayBuffer(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.full = True
             self.pos = 0
+
+    def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
+        shape = (self.n_envs, *store.obs_shape)
+        if obs.shape == shape[:1]:  # Discrete
+            return obs.reshape(shape)
+        if obs.shape != shape:
+            raise ValueError(
+                f"observations: expected the shape {shape} of the replay buffer, found {obs.shape}. "
+                "Wrappers that change the shape (VecTransposeImage, VecFrameStack) belong inside VecNormalize."
+            )
+        return obs
+
+    def reset(self) -> None:
+        """Forget everything."""
+        super().reset()
+        self._stores = {key: store.emptied() for key, store in self._stores.items()}
+        self._episode_starts[:] = True
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
         """
@@ -290,10 +309,8 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
             prediction_depth,
             frame_stack,
         )
-        if alpha < 0:
-            raise ValueError(f"alpha (priority exponent): expected at least 0, found {alpha}")
-        if not 0 <= beta <= 1:
-            raise ValueError(f"beta (importance weights): expected a number in [0, 1], found {beta}")
+        check_number("alpha (priority exponent)", alpha, 0)
+        check_number("beta (importance weights)", beta, 0, 1)
         self.alpha = alpha
         self.beta = beta
         self._tree = SumTree(self.buffer_size * n_envs)
@@ -306,12 +323,16 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         return super().nbytes + self._tree.nbytes
 
     def can_sample(self) -> bool:
-        """Whether there is a start to draw."""
-        return self.size() >= self.window
+        return super().can_sample() and self.size() >= self.window
+
+    def reset(self) -> None:
+        super().reset()
+        self._tree = SumTree(self.buffer_size * self.n_envs)
+        self._max_priority = 1.0
 
     def add(self, *args, **kwargs) -> None:
-        super().add(*args, **kwargs)
         self._follow_window()
+        super().add(*args, **kwargs)
         self._set_ages(0, 1, 0.0)  # what was overwritten
         self._set_ages(self._tree_window - 1, self._tree_window, self._max_priority)
 

@@ -12,17 +12,18 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 
 from sb3_eqr.common.augmentations import ImageAugmentation
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.checks import check_finite, check_number
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.safe_files import SafeFiles
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
-from sb3_eqr.common.update_monitor import UpdateMonitor, check_finite
+from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
@@ -35,6 +36,14 @@ class TDLoss(NamedTuple):
     q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
 
 
+# What of the replay buffer is set by an argument of the algorithm, which may move it later.
+BUFFER_ARGUMENTS = {
+    "n_steps": "n_steps",
+    "gamma": "gamma",
+    "prediction_depth": "prediction_depth",
+    "alpha": "priority_alpha",
+    "beta": "priority_beta",
+}
 METRICS = ("td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value")
 
 
@@ -46,7 +55,6 @@ class EqRAlgorithm(SafeFiles):
     For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
     """
 
-    replay_buffer_base = SequenceReplayBuffer
     policy: EqRPolicy
     replay_buffer: SequenceReplayBuffer | None
     replay_buffer_class: type[SequenceReplayBuffer] | None
@@ -129,13 +137,18 @@ class EqRAlgorithm(SafeFiles):
             "n_steps": 1,
             "replay_buffer_class": buffer_class,
             "target_update_interval": self.target_update_interval or self.n_envs,
-            "policy_kwargs": {**self.policy_kwargs, "latent_model_kwargs": self._latent_model_kwargs()},
+            "policy_kwargs": {**self.policy_kwargs, "reward_loss": self.reward_loss},
         }
         true = {name: getattr(self, name) for name in shown}
         self.__dict__.update(shown)
         super()._setup_model()
         self.__dict__.update(true)
 
+        if self.depth > 0 and self.get_coef > 0 and not self.policy.latent_model.group.has_inverse:
+            raise ValueError(
+                f"get_coef: the GET loss needs a group with inverses, found {self.policy.latent_model.group}. "
+                "Pass get_coef=0 or another group."
+            )
         if self._uses_aet and self.policy.shared_projection and not self.policy.online.net_arch:
             raise ValueError(
                 "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
@@ -148,8 +161,9 @@ class EqRAlgorithm(SafeFiles):
             )
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         encoder_modules = self.policy.online.features_extractor.modules()
-        depend_on_mode = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
+        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd)
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
+        self._target_is_copy = True  # it is built as one
         self._monitor = UpdateMonitor(METRICS, self.policy, self.policy.optimizer)
         obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
         obs_spaces = obs_spaces or {"": self.observation_space}
@@ -164,22 +178,35 @@ class EqRAlgorithm(SafeFiles):
                 f"{type(self).__name__}: expected a policy derived from {base.__name__}, found {self.policy_class}. "
                 f"Use one of {list(self.policy_aliases)}; a file is loaded by the class that saved it."
             )
-        if not isinstance(self.prediction_depth, (int, np.integer)) or self.prediction_depth < 0:
-            raise ValueError(f"prediction_depth: expected a whole number of at least 0, found {self.prediction_depth!r}")
-        for name in ("aet_coef", "get_coef", "reward_coef", "shift_pixels", "intensity_scale"):
-            if not (getattr(self, name) >= 0 and np.isfinite(getattr(self, name))):
-                raise ValueError(f"{name}: expected a finite number of at least 0, found {getattr(self, name)!r}")
-        if not 0 <= self.tau <= 1:
-            raise ValueError(f"tau: expected a number in [0, 1], found {self.tau}")
+        for name in ("prediction_depth", "shift_pixels"):
+            check_number(name, getattr(self, name), 0, whole=True)
+        for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
+            check_number(name, getattr(self, name), 0)
+        check_number("tau", self.tau, 0, 1)
+        check_number("batch_size", self.batch_size, 1, whole=True)
         if self.depth > 0 and self.batch_size < 2:
             raise ValueError(
                 f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
                 "Pass a larger batch_size or prediction_depth=0."
             )
-        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, SequenceReplayBuffer):
+        chosen = self.replay_buffer_class
+        if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, SequenceReplayBuffer)):
             raise ValueError(
-                f"replay_buffer_class: expected SequenceReplayBuffer or a class derived from it, found "
-                f"{self.replay_buffer_class.__name__}. Leave it out to get the one that prioritized_replay asks for."
+                f"replay_buffer_class: expected SequenceReplayBuffer or a class derived from it, found {chosen}. "
+                "Leave it out to get the one that prioritized_replay asks for."
+            )
+        for name, argument in BUFFER_ARGUMENTS.items():
+            if name in self.replay_buffer_kwargs:
+                raise ValueError(
+                    f"replay_buffer_kwargs: expected arguments that {type(self).__name__} does not set itself, found "
+                    f"{name!r}. Pass {argument}={self.replay_buffer_kwargs[name]!r} to {type(self).__name__}."
+                )
+        normalize = self._vec_normalize_env
+        if normalize is not None and normalize.observation_space != self.observation_space:
+            raise ValueError(
+                f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
+                f"originals; found {normalize.observation_space} there, {self.observation_space} outside. "
+                "Use VecNormalize(VecTransposeImage(env)), for images."
             )
 
     @property
@@ -193,24 +220,17 @@ class EqRAlgorithm(SafeFiles):
 
     @property
     def _target_is_online(self) -> bool:
-        """
-        Whether target features are online features: the target is copied after every update, and the encoder does not
-        depend on train mode. Then one pass serves for both.
-        """
-        return self.tau == 1.0 and self.target_update_interval is None and self._encoder_ignores_mode
-
-    def _latent_model_kwargs(self) -> dict[str, Any] | None:
-        if self.depth == 0:
-            return None
-        return {
-            "reward_loss": self.reward_loss if self.reward_coef else None,
-            "with_symmetry": self.get_coef > 0,
-        }
+        """Whether target features are online features, so that one pass serves for both."""
+        return self._target_is_copy and self._encoder_ignores_mode
 
     def _find_frame_stack(self) -> int:
+        found = 1
         stack = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
-        is_stack = isinstance(stack, VecFrameStack) and is_image_space(self.observation_space)
-        found = stack.stacked_obs.n_stack if is_stack else 1  # type: ignore[union-attr]
+        if isinstance(stack, VecFrameStack) and is_image_space(self.observation_space):
+            # Frames lie side by side along the first axis only if channels were what was stacked.
+            channels_first = is_image_space_channels_first(stack.venv.observation_space)  # type: ignore[arg-type]
+            if stack.stacked_obs.channels_first == channels_first:
+                found = stack.stacked_obs.n_stack
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
     def _make_replay_buffer(self, buffer_class: type[SequenceReplayBuffer]) -> SequenceReplayBuffer:
@@ -239,7 +259,7 @@ class EqRAlgorithm(SafeFiles):
         """
         buffer = self.replay_buffer
         assert buffer is not None
-        self._monitor.collect(self._n_updates)
+        self._collect_metrics()
         # A schedule may have moved these since the last call.
         buffer.n_steps, buffer.gamma, buffer.prediction_depth = self.n_steps, self.gamma, self.depth
         if not buffer.can_sample():
@@ -249,7 +269,7 @@ class EqRAlgorithm(SafeFiles):
             self.logger.record("train/beta", buffer.beta)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        self._monitor.start_round()
+        self._monitor.start_round(self._n_updates)
         for _ in range(gradient_steps):
             self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -269,8 +289,10 @@ class EqRAlgorithm(SafeFiles):
         grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
         self.policy.optimizer.step()
         self._n_updates += 1
+        self._target_is_copy = False
         if self.target_update_interval is None:
             self.policy.update_target(self.tau)
+            self._target_is_copy = self.tau == 1.0
         if isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
             self.replay_buffer.update_priorities(samples.indices, td.priorities)
         with th.no_grad():
@@ -297,7 +319,7 @@ class EqRAlgorithm(SafeFiles):
             if self.double_q and not self._target_is_online:
                 next_online = policy.online.features(_map(lambda obs: obs[:batch_size], other_observations))
         td = self._td_loss(samples, features, next_online, next_target)
-        if samples.mask is None or policy.latent_model is None:
+        if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
             target_states = features.detach() if self._target_is_online else policy.target.features(observations)
@@ -305,14 +327,13 @@ class EqRAlgorithm(SafeFiles):
             if self._uses_aet:
                 rollout = other_features[batch_size:].unflatten(0, samples.mask.shape)  # (B, M, D)
                 target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
-        assert policy.latent_model_target is not None
         auxiliary = policy.latent_model(
             features,
             samples.rollout_actions,
-            samples.rollout_rewards,
+            samples.rollout_rewards if self.reward_coef > 0 else None,
             samples.mask,
             target_states,
-            policy.latent_model_target,
+            policy.latent_model_target if self.get_coef > 0 else None,
             policy.project if self._uses_aet else None,
             policy.target_project,
         )
@@ -350,14 +371,16 @@ class EqRAlgorithm(SafeFiles):
         infos: list[dict[str, Any]],
     ) -> None:
         # What VecNormalize has clipped may hide an infinity: its originals are looked at.
-        normalize = self._vec_normalize_env
-        step = self.num_timesteps
-        check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
-        check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
-        for info in infos:
-            if info.get("terminal_observation") is not None:
-                check_finite("terminal observation", info["terminal_observation"], step)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        normalize, step = self._vec_normalize_env, self.num_timesteps
+        try:
+            check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
+            check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
+            for info in infos:
+                check_finite("terminal observation", info.get("terminal_observation", 0), step)
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        except ValueError:
+            self._last_obs = None  # the environment has moved on: another call of learn must reset it
+            raise
 
     def learn(
         self: SelfEqRAlgorithm,
@@ -370,15 +393,30 @@ class EqRAlgorithm(SafeFiles):
     ) -> SelfEqRAlgorithm:
         """As SB3's ``learn``, with the same parameters."""
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        self._monitor.collect(self._n_updates)
+        self._collect_metrics()
         return self
 
+    def _collect_metrics(self) -> None:
+        """Log the figures of the last round, which are computed by now; roll back if one is not finite."""
+        try:
+            for name, value in self._monitor.collect().items():
+                self.logger.record_mean(f"train/{name}", value)
+        except BadUpdateError as error:
+            self._n_updates = error.n_updates
+            self._target_is_copy = False
+            raise
+
     def dump_logs(self) -> None:
-        """Write log data. Only here are the losses read from the device: the mean over all updates since the last time."""
-        self._monitor.collect(self._n_updates)
-        for name, value in self._monitor.means().items():
-            self.logger.record(f"train/{name}", value)
+        """Write log data; losses are means over all updates since the last time."""
+        self._collect_metrics()
         super().dump_logs()
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """As SB3's ``set_parameters``, with the same parameters."""
+        self._target_is_copy = False  # nothing is known of them
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save(
         self,
@@ -393,11 +431,18 @@ class EqRAlgorithm(SafeFiles):
         :param exclude: names of attributes to leave out beside the default ones
         :param include: names of attributes to save although they are left out by default
         """
-        self._monitor.collect(self._n_updates)
+        self._collect_metrics()
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "_encoder_ignores_mode", "_augment"]
+        return [
+            *super()._excluded_save_params(),
+            "_monitor",
+            "_trained",
+            "_encoder_ignores_mode",
+            "_target_is_copy",
+            "_augment",
+        ]
 
 
 def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:

@@ -3,19 +3,20 @@
 from math import prod
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from torch import nn
 
-from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, make_group
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
 from sb3_eqr.common.layers import ConvTrunk
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 DEFAULT_GROUP = "SE(2)"  # §7 and Table 5
 DEFAULT_N_BLOCKS = 12  # Table 5, for SE(2) and GL(2)
+DEFAULT_N_TRANSLATIONS = 32  # Table 5, for T(2)
 
 
 class ConvExtractor(BaseFeaturesExtractor):
@@ -49,14 +50,16 @@ class ConvExtractor(BaseFeaturesExtractor):
         return self.trunk(observations)
 
 
-def default_trunk(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> type[BaseFeaturesExtractor]:
     """
     :param observation_space: any that SB3 supports
+    :param normalized_image: whether images are floats already
     :return: the paper's convolutions for images, SB3's extractors otherwise
     """
     if isinstance(observation_space, spaces.Dict):
         return CombinedExtractor
-    return ConvExtractor if is_image_space(observation_space) else FlattenExtractor
+    is_image = is_image_space(observation_space, normalized_image=normalized_image)
+    return ConvExtractor if is_image else FlattenExtractor
 
 
 class GroupFeaturesExtractor(BaseFeaturesExtractor):
@@ -66,11 +69,13 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
 
     :param observation_space: any that the trunk takes
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
-    :param n_blocks: K ≥ 1; ``None``: 12 (Table 5), or 1 where the name counts its own blocks ("SE(2)^8 x SO(3)^4", "none")
+    :param n_blocks: K ≥ 1; ``None``: 12, for T(n) 32 (Table 5), and 1 where the name counts its own blocks
+        ("SE(2)^8 x SO(3)^4", "none")
     :param parameterization: of rotations, "euler" or "exp"
     :param trunk_class: features extractor in front of the linear layer; ``None``: the paper's convolutions for images,
         SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
+    :param normalized_image: as in SB3's extractors: images are floats already; reaches the default trunk
     :raises ValueError: for an unknown group or a number of blocks below 1
     """
 
@@ -82,17 +87,23 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         parameterization: str = "euler",
         trunk_class: type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
+        normalized_image: bool = False,
     ):
         made = make_group(group, parameterization)
         if n_blocks is None:
-            n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else DEFAULT_N_BLOCKS
-        if not isinstance(n_blocks, (int, np.integer)) or n_blocks < 1:
-            raise ValueError(f"n_blocks: expected a whole number of at least 1, found {n_blocks!r}")
+            n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
+            n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
+        check_number("n_blocks", n_blocks, 1, whole=True)
         super().__init__(observation_space, n_blocks * prod(made.element_shape))
         self.group = made
         self.n_blocks = n_blocks
         self._description = f"{made}^{n_blocks}, {parameterization}"
-        self.trunk = (trunk_class or default_trunk(observation_space))(observation_space, **(trunk_kwargs or {}))
+        trunk_kwargs = dict(trunk_kwargs or {})
+        if trunk_class is None:
+            trunk_class = default_trunk(observation_space, normalized_image)
+            if trunk_class is not FlattenExtractor:
+                trunk_kwargs.setdefault("normalized_image", normalized_image)
+        self.trunk = trunk_class(observation_space, **trunk_kwargs)
         self.to_algebra = nn.Linear(self.trunk.features_dim, n_blocks * made.num_params)
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:

@@ -39,6 +39,12 @@ class FrameStore:
         self._references = np.zeros(capacity, dtype=np.int32)
         self._free = np.zeros(capacity, dtype=np.int32)
 
+    def emptied(self) -> "FrameStore":
+        """
+        :return: an empty store of the same kind
+        """
+        return FrameStore(*self._ids.shape[:2], self.obs_shape, self._frames.dtype, self.n_stack)
+
     @property
     def nbytes(self) -> int:
         """Memory, in bytes."""

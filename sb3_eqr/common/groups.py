@@ -332,6 +332,8 @@ def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
     """
     if isinstance(group, Group):
         return group
+    if not isinstance(group, str):
+        raise ValueError(f"group: expected {_LEGAL}; found {group!r}")
     if parameterization not in ROTATIONS:
         raise ValueError(f"parameterization: expected one of {list(ROTATIONS)}, found {parameterization!r}")
     factors = [_make_factor(part, group, parameterization) for part in re.split(r"[x×]", group.replace(" ", ""))]

@@ -30,10 +30,8 @@ class LatentModel(nn.Module):
     :param n_blocks: K
     :param n_actions: A
     :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
-    :param reward_loss: "mse" (Eq. 17), "categorical" (three signs, as in the authors' released code),
-        ``None``: no reward network
-    :param with_symmetry: whether to build ρ and b, for the GET loss
-    :raises ValueError: for an unknown reward loss, or ``with_symmetry`` with a group that has no inverse
+    :param reward_loss: "mse" (Eq. 17) or "categorical" (three signs, as in the authors' released code)
+    :raises ValueError: for an unknown reward loss
     """
 
     def __init__(
@@ -42,42 +40,36 @@ class LatentModel(nn.Module):
         n_blocks: int,
         n_actions: int,
         hidden_dim: int = 256,
-        reward_loss: str | None = "mse",
-        with_symmetry: bool = True,
+        reward_loss: str = "mse",
     ):
         super().__init__()
-        if reward_loss is not None and reward_loss not in REWARD_LOSSES:
+        if reward_loss not in REWARD_LOSSES:
             raise ValueError(f"reward_loss: expected one of {list(REWARD_LOSSES)}, found {reward_loss!r}")
-        if with_symmetry and not group.has_inverse:
-            raise ValueError(
-                f"get_coef: the GET loss needs a group with inverses, found {group}. Pass get_coef=0 or another group."
-            )
         self.group = group
         self.n_blocks = n_blocks
         self.n_actions = n_actions
         state_dim = n_blocks * prod(group.element_shape)
         algebra_dim = n_blocks * group.num_params
         self.transition = _hidden_layer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
-        self.reward_net = None  # r_ψ
-        if reward_loss is not None:
-            n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
-            self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)
-        self.action_symmetry = _hidden_layer(state_dim, hidden_dim, algebra_dim) if with_symmetry else None  # ρ
-        self.projection = nn.Linear(state_dim, hidden_dim) if with_symmetry else None  # b
+        n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
+        self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)  # r_ψ
+        self.action_symmetry = _hidden_layer(state_dim, hidden_dim, algebra_dim)  # ρ
+        self.projection = nn.Linear(state_dim, hidden_dim)  # b
 
     def forward(
         self,
         state: th.Tensor,
         actions: th.Tensor,
-        rewards: th.Tensor,
+        rewards: th.Tensor | None,
         mask: th.Tensor,
         target_states: th.Tensor,
-        target: "LatentModel",
+        target: "LatentModel | None",
         project: Projection | None,
         target_project: Projection,
     ) -> LatentLosses:
         """
-        The losses of Eq. 18 and 19, per sample, each step weighted by the one mask.
+        The losses of Eq. 18 and 19, per sample, each step weighted by the one mask. ``None`` for ``rewards``, ``target``
+        or ``project`` leaves the reward, the GET or the AET loss out.
 
         :param state: x₀ = τ(s_t), online, (B, D)
         :param actions: a_t ... a_{t+M-1}, int64, (B, M)
@@ -86,7 +78,7 @@ class LatentModel(nn.Module):
         :param target_states: x̄₀ ... x̄_M from the target encoder, without gradient, (B, M + 1, D);
             without AET, x̄₀ is enough, (B, 1, D)
         :param target: the target copy of this model, in eval mode, its parameters frozen
-        :param project: p, (..., D) -> (..., P); ``None`` leaves the AET loss out
+        :param project: p, (..., D) -> (..., P)
         :param target_project: p̄
         :return: three losses, (B,) each; ``None`` for one that is off
         """
@@ -98,9 +90,9 @@ class LatentModel(nn.Module):
             with th.no_grad():
                 target_projected = target_project(target_states[:, 1:])  # (B, M, P)
             aet = (normalized_distance(project(predicted), target_projected) * mask).sum(dim=1)
-        if self.action_symmetry is not None:
+        if target is not None:
             get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
-        if self.reward_net is not None:
+        if rewards is not None:
             outputs = self.reward_net(predicted.flatten(0, 1)).unflatten(0, mask.shape)  # (B, M, 1 or 3)
             reward = (self._reward_loss(outputs, rewards) * mask).sum(dim=1)
         return LatentLosses(aet, get, reward)
@@ -151,7 +143,6 @@ class LatentModel(nn.Module):
         :param target_state: x̄₀, (B, D)
         :return: (B,)
         """
-        assert self.action_symmetry is not None and self.projection is not None and target.projection is not None
         partner = target_state[th.randint(len(state), (len(state),), device=state.device)]  # x̄_j of Algorithm 1
         with th.no_grad():  # τ_g carries no gradient, as in the authors' code
             inverse = self.group.inverse(self._blocks(state))

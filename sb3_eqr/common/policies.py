@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
+from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import ConvExtractor, GroupFeaturesExtractor
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
@@ -44,8 +45,8 @@ class EqRPolicy(BasePolicy):
     """
 
     action_space: spaces.Discrete
-    latent_model: LatentModel | None
-    latent_model_target: LatentModel | None
+    latent_model: LatentModel
+    latent_model_target: LatentModel
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
 
@@ -60,8 +61,9 @@ class EqRPolicy(BasePolicy):
         noisy: bool,
         sigma_init: float,
         shared_projection: bool,
-        latent_model_kwargs: dict[str, Any] | None,
+        reward_loss: str,
     ) -> None:
+        check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
@@ -70,7 +72,7 @@ class EqRPolicy(BasePolicy):
         self.noisy = noisy
         self.sigma_init = sigma_init
         self.shared_projection = shared_projection
-        self.latent_model_kwargs = latent_model_kwargs
+        self.reward_loss = reward_loss
 
     @property
     def online(self) -> EqRNetwork:
@@ -87,33 +89,36 @@ class EqRPolicy(BasePolicy):
         trunk_kwargs = dict(self.features_extractor_kwargs)
         if not self.normalize_images and issubclass(self.features_extractor_class, ConvExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
-        if self.group is None or issubclass(self.features_extractor_class, GroupFeaturesExtractor):
+        if self.group is None:
             return self.features_extractor_class(self.observation_space, **trunk_kwargs)
+        group_kwargs = {
+            "group": self.group,
+            "n_blocks": self.n_blocks,
+            "parameterization": self.parameterization,
+            "normalized_image": not self.normalize_images,
+        }
+        if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
+            return self.features_extractor_class(self.observation_space, **{**group_kwargs, **trunk_kwargs})
         return GroupFeaturesExtractor(
             self.observation_space,
-            group=self.group,
-            n_blocks=self.n_blocks,
-            parameterization=self.parameterization,
+            **group_kwargs,  # type: ignore[arg-type]
             trunk_class=self.features_extractor_class,
             trunk_kwargs=trunk_kwargs,
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # type: ignore[misc]
-        self.latent_model = self.latent_model_target = None
-        self.own_projection = self.own_projection_target = None
-        if self.latent_model_kwargs is None:
-            return
         encoder = self.online.features_extractor
         if isinstance(encoder, GroupFeaturesExtractor):
             group, n_blocks = encoder.group, encoder.n_blocks
         else:
             group, n_blocks = NoGroup(encoder.features_dim), 1
         self.latent_model = LatentModel(
-            group, n_blocks, int(self.action_space.n), self.latent_hidden_dim, **self.latent_model_kwargs
+            group, n_blocks, int(self.action_space.n), self.latent_hidden_dim, self.reward_loss
         ).to(self.device)
         self.latent_model_target = _frozen_copy(self.latent_model)
         parameters = list(self.latent_model.parameters())
+        self.own_projection = self.own_projection_target = None
         if not self.shared_projection:
             self.own_projection = nn.Linear(encoder.features_dim, self.latent_hidden_dim).to(self.device)
             self.own_projection_target = _frozen_copy(self.own_projection)
@@ -146,10 +151,9 @@ class EqRPolicy(BasePolicy):
         pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
             (self.online, self.target),
             (self.own_projection, self.own_projection_target),
+            (self.latent_model.transition, self.latent_model_target.transition),
+            (self.latent_model.projection, self.latent_model_target.projection),
         ]
-        if self.latent_model is not None and self.latent_model_target is not None:
-            pairs.append((self.latent_model.transition, self.latent_model_target.transition))
-            pairs.append((self.latent_model.projection, self.latent_model_target.projection))
         return [(online, target) for online, target in pairs if online is not None and target is not None]
 
     def set_training_mode(self, mode: bool) -> None:
@@ -159,8 +163,7 @@ class EqRPolicy(BasePolicy):
         :param mode: True for training
         """
         super().set_training_mode(mode)
-        if self.latent_model is not None:
-            self.latent_model.train(mode)
+        self.latent_model.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -173,7 +176,7 @@ class EqRPolicy(BasePolicy):
             noisy=self.noisy,
             sigma_init=self.sigma_init,
             shared_projection=self.shared_projection,
-            latent_model_kwargs=self.latent_model_kwargs,
+            reward_loss=self.reward_loss,
         )
         return data
 
@@ -182,5 +185,5 @@ def _frozen_copy(module: Module) -> Module:
     """A copy in eval mode without trained parameters. Parts that no target needs (r_ψ, ρ) are left out."""
     copy = deepcopy(module)
     if isinstance(copy, LatentModel):
-        copy.reward_net = copy.action_symmetry = None
+        del copy.reward_net, copy.action_symmetry
     return copy.requires_grad_(False).eval()

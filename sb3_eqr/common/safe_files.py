@@ -8,7 +8,7 @@ import random
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, BinaryIO, ClassVar, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import torch as th
@@ -84,13 +84,7 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
 
 
 class SafeFiles(OffPolicyAlgorithm):
-    """
-    SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with whole files only.
-
-    ``replay_buffer_base``: what a loaded replay buffer must be.
-    """
-
-    replay_buffer_base: ClassVar[type[ReplayBuffer]] = ReplayBuffer
+    """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with whole files only."""
 
     def save(
         self,
@@ -124,9 +118,10 @@ class SafeFiles(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> SelfSafeFiles:
         """
-        As SB3's ``load``, with the same parameters. Where the model has a seed, the random generators are put back to
-        where they were at saving, so that a run goes on as if it had not stopped (pass ``force_reset=False`` and an
-        environment in the same state).
+        As SB3's ``load``, with the same parameters. Where the model has a seed (and no other is given here), the random
+        generators are put back to where they were at saving: a run that was saved after ``learn``, or between two
+        rollouts, goes on as if it had not stopped (pass ``force_reset=False`` and an environment in the same state).
+        SB3's CheckpointCallback saves in the middle of a step: its files go on from a fresh episode.
 
         :raises ValueError: if the file is cut off, or was saved by another class
         """
@@ -138,7 +133,8 @@ class SafeFiles(OffPolicyAlgorithm):
                     "Load an earlier checkpoint."
                 )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        if model.seed is not None and getattr(model, "rng_state", None) is not None:
+        reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
+        if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
         return model
 
@@ -160,10 +156,11 @@ class SafeFiles(OffPolicyAlgorithm):
 
         :param path: path to the file, or a file-like
         :param truncate_last_traj: has no effect here
-        :raises ValueError: if the file is cut off, or holds a buffer for other observations, actions or environments;
+        :raises ValueError: if the file is cut off, or holds a buffer of another kind, or for other spaces or environments;
             the model then keeps the buffer it had
         """
         before = self.replay_buffer
+        assert before is not None
         try:
             super().load_replay_buffer(path, truncate_last_traj)
         except (EOFError, pickle.UnpicklingError, AssertionError) as error:
@@ -173,8 +170,12 @@ class SafeFiles(OffPolicyAlgorithm):
                 f"found one that is cut off or something else ({error}). Load an earlier one."
             ) from error
         loaded, self.replay_buffer = self.replay_buffer, before
-        expected = (self.replay_buffer_base.__name__, self.observation_space, self.action_space, self.n_envs)
-        found = (type(loaded).__name__, loaded.observation_space, loaded.action_space, loaded.n_envs)  # type: ignore[union-attr]
-        if not isinstance(loaded, self.replay_buffer_base) or expected[1:] != found[1:]:
-            raise ValueError(f"{path}: expected a replay buffer for {expected}, found {found}. Load the one of this model.")
+        expected, found = _describe(before), _describe(loaded)
+        if expected != found:
+            raise ValueError(f"{path}: expected a replay buffer of {expected}, found {found}. Load the one of this model.")
         self.replay_buffer = loaded
+
+
+def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:
+    names = ("observation_space", "action_space", "n_envs", "alpha")  # α is in every stored priority
+    return {"class": type(buffer).__name__, **{name: getattr(buffer, name) for name in names if hasattr(buffer, name)}}

@@ -1,27 +1,31 @@
-"""Numbers that are not finite: refused where they come in, undone where they come out of an update."""
+"""The figures of each update, read when they are long computed, and the way back from an update that went wrong."""
 
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from torch import nn
 
 
-def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
+class BadUpdateError(FloatingPointError):
     """
-    :param what: the name of the values, for the message
-    :param values: from the environment; integers are always finite
-    :param step: number of environment steps so far, for the message
-    :raises ValueError: if one is NaN or infinite
+    An update whose figures are not finite. Model and optimiser have been put back.
+
+    :param message: what was found
+    :param n_updates: the number of updates that the model is left with
     """
-    for key, array in values.items() if isinstance(values, dict) else [("", values)]:
-        array = np.asarray(array)
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise ValueError(
-                f"step {step}: expected finite {what}s from the environment, found {array[~np.isfinite(array)].flat[0]} "
-                f"in the {what}{f' {key!r}' if key else ''}. It was not stored and the model is as before. "
-                "Mend the environment; SB3's VecCheckNan tells which action led there."
-            )
+
+    def __init__(self, message: str, n_updates: int):
+        super().__init__(message)
+        self.n_updates = n_updates
+
+
+class Backup(NamedTuple):
+    """Model and optimiser at the start of a round of updates."""
+
+    n_updates: int
+    model: list[th.Tensor]
+    optimizer: dict[tuple[th.Tensor, str], th.Tensor]
 
 
 class UpdateMonitor:
@@ -29,7 +33,8 @@ class UpdateMonitor:
     The figures of each update, read when they are asked for, and the way back from an update that went wrong.
 
     Figures stay on the device until the next round of updates, when they are long computed: no update waits for them.
-    One that is not finite puts model and optimiser back to where the round began.
+    The losses of an update are computed before its step, so the first update of a round is what tells whether the
+    round before left a sound model. That is why the starts of two rounds are kept.
 
     :param names: of the figures
     :param model: whose parameters and buffers are kept
@@ -41,17 +46,23 @@ class UpdateMonitor:
         self._model = model
         self._optimizer = optimizer
         self._pending: list[th.Tensor] = []  # (len(names),) each
-        self._sums = np.zeros(len(names))
-        self._count = 0
-        self._backup: list[th.Tensor] = []
+        self._start: Backup | None = None  # of the last round
+        self._sound_start: Backup | None = None  # of the round before: its figures are known to be finite
 
-    def start_round(self) -> None:
-        """Remember model and optimiser as they are now."""
-        tensors = list(self._tensors())
-        if len(tensors) == len(self._backup):
-            th._foreach_copy_(self._backup, tensors)
-        else:  # the first round, or the optimiser has made its state since
-            self._backup = [tensor.clone() for tensor in tensors]
+    def start_round(self, n_updates: int) -> None:
+        """
+        Remember model and optimiser as they are now.
+
+        :param n_updates: updates done so far
+        """
+        model, state = self._model_tensors(), self._optimizer_tensors()
+        old, self._sound_start = self._sound_start, self._start
+        if old is None or old.optimizer.keys() != state.keys():  # the first rounds: make room
+            kept = [tensor.clone() for tensor in model], {key: tensor.clone() for key, tensor in state.items()}
+        else:
+            kept = old.model, old.optimizer
+            th._foreach_copy_([*kept[0], *kept[1].values()], [*model, *(state[key] for key in kept[1])])
+        self._start = Backup(n_updates, *kept)
 
     def add(self, figures: list[th.Tensor]) -> None:
         """
@@ -59,53 +70,50 @@ class UpdateMonitor:
         """
         self._pending.append(th.stack(figures))
 
-    def collect(self, n_updates: int) -> None:
+    def collect(self) -> dict[str, float]:
         """
         Take in the figures of the last round.
 
-        :param n_updates: updates done so far, for the message
-        :raises FloatingPointError: if one is NaN or infinite; model and optimiser are then as before that round
+        :return: their means over the round; nothing if there was none
+        :raises BadUpdateError: if one is NaN or infinite; model and optimiser are then as they last were sound
         """
         if not self._pending:
-            return
+            return {}
+        assert self._start is not None
         figures = th.stack(self._pending).cpu().numpy()  # (updates, names)
         self._pending.clear()
         finite = np.isfinite(figures)
-        if not finite.all():
-            first = int(np.argmin(finite.all(axis=1)))
-            self._roll_back()
-            wrong = [f"{n} = {v}" for n, v, ok in zip(self.names, figures[first], finite[first], strict=True) if not ok]
-            raise FloatingPointError(
-                f"update {n_updates - len(figures) + first + 1}: expected finite losses, found {', '.join(wrong)}. "
-                f"The model was put back to update {n_updates - len(figures)} and can be saved. "
-                "Lower learning_rate or max_grad_norm, or check the scale of observations and rewards."
-            )
-        self._sums += figures.sum(axis=0)
-        self._count += len(figures)
+        if finite.all():
+            return dict(zip(self.names, figures.mean(axis=0, dtype=np.float64).tolist(), strict=True))
+        first = int(np.argmin(finite.all(axis=1)))
+        bad_update = self._start.n_updates + first + 1
+        sound = self._start if first > 0 or self._sound_start is None else self._sound_start
+        self._put_back(sound)
+        wrong = [f"{n} = {v}" for n, v, ok in zip(self.names, figures[first], finite[first], strict=True) if not ok]
+        raise BadUpdateError(
+            f"update {bad_update}: expected finite losses, found {', '.join(wrong)}. "
+            f"The model was put back to update {sound.n_updates} and can be saved. "
+            "Lower learning_rate or max_grad_norm, or check the scale of observations and rewards.",
+            sound.n_updates,
+        )
 
-    def means(self) -> dict[str, float]:
-        """
-        :return: the mean of each figure over the updates since the last call; nothing if there was none
-        """
-        if self._count == 0:
-            return {}
-        means = dict(zip(self.names, (self._sums / self._count).tolist(), strict=True))
-        self._sums[:] = 0.0
-        self._count = 0
-        return means
-
-    def _roll_back(self) -> None:
-        tensors = list(self._tensors())
-        if len(tensors) == len(self._backup):
-            with th.no_grad():
-                th._foreach_copy_(tensors, self._backup)
-            return
-        self._optimizer.state.clear()  # the round was the first one: the optimiser had no state
+    def _put_back(self, backup: Backup) -> None:
+        self._start = self._sound_start = None
         with th.no_grad():
-            th._foreach_copy_(list(self._tensors()), self._backup)
+            th._foreach_copy_(self._model_tensors(), backup.model)
+        state = self._optimizer_tensors()
+        for parameter in {parameter for parameter, _ in state.keys() - backup.optimizer.keys()}:
+            del self._optimizer.state[parameter]  # it had none then
+        for key, tensor in backup.optimizer.items():
+            state[key].copy_(tensor)
 
-    def _tensors(self) -> Iterator[th.Tensor]:
-        yield from (parameter.detach() for parameter in self._model.parameters())
-        yield from self._model.buffers()
-        for state in self._optimizer.state.values():
-            yield from (value for value in state.values() if isinstance(value, th.Tensor))
+    def _model_tensors(self) -> list[th.Tensor]:
+        return [*(parameter.detach() for parameter in self._model.parameters()), *self._model.buffers()]
+
+    def _optimizer_tensors(self) -> dict[tuple[th.Tensor, str], th.Tensor]:
+        return {
+            (parameter, name): value
+            for parameter, state in self._optimizer.state.items()
+            for name, value in state.items()
+            if isinstance(value, th.Tensor)
+        }

@@ -10,6 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import DEFAULT_GROUP, ConvExtractor
 from sb3_eqr.common.groups import Group
 from sb3_eqr.common.layers import DistributionalHead
@@ -97,15 +98,16 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     :param optimizer_class: The optimizer to use, Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
-        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder, a stock Q network)
-    :param n_blocks: K; ``None``: 12 (Table 5), or 1 where the group's name counts its own blocks
+        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
+    :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
     :param parameterization: of rotations, "euler" or "exp"
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
     :param shared_projection: whether the AET loss projects with the first layer of the Q head; else with a layer of its own
-    :param latent_model_kwargs: set by the algorithm: which parts of the latent model to build; ``None`` for no latent model
+    :param reward_loss: set by the algorithm, see there
+    :raises ValueError: for an argument out of its range
     """
 
     default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
@@ -133,9 +135,10 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         sigma_init: float = 0.5,
         latent_hidden_dim: int = 256,
         shared_projection: bool = True,
-        latent_model_kwargs: dict[str, Any] | None = None,
+        reward_loss: str = "mse",
     ):
         net_arch = list(DEFAULT_NET_ARCH) if net_arch is None else net_arch
+        check_number("n_quantiles", n_quantiles, 1, whole=True)
         self._configure(
             group=group,
             n_blocks=n_blocks,
@@ -145,7 +148,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
             sigma_init=sigma_init,
             latent_hidden_dim=latent_hidden_dim,
             shared_projection=shared_projection,
-            latent_model_kwargs=latent_model_kwargs,
+            reward_loss=reward_loss,
         )
         super().__init__(
             observation_space,
