@@ -5,7 +5,7 @@ EqRQRDQN on CartPole-v1: a mean return of at least 475 within 30,000 steps.
     python examples/cartpole.py --seeds 0 1 2 3 4 --stock     # sb3_contrib's QRDQN with the same settings
 
 The values shared with RL Zoo's tuned QRDQN entry for CartPole-v1 are marked (Zoo); the others were chosen by hand
-on seeds 2 and 3, see docs/results/cartpole.md.
+on seed 3, see docs/results/cartpole.md.
 """
 
 import argparse

@@ -362,6 +362,19 @@ def test_a_schedule_may_move_n_and_gamma():
 # ---------------------------------------------------------------------------------------------- learning
 
 
+def test_singular_states_of_gl_neither_stop_nor_poison_a_run():
+    """Every state the zero matrix: no inverse anywhere."""
+    model = make(ChainEnv(), policy_kwargs={"group": "GL(2)"})
+    encoder = model.quantile_net.features_extractor.to_algebra
+    th.nn.init.zeros_(encoder.weight)
+    th.nn.init.zeros_(encoder.bias)
+    model.policy.update_target(1.0)
+    assert (model.quantile_net.features(th.rand(2, 3)) == 0).all()
+    model.learn(100)
+    assert model._n_updates > 0 and all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert (encoder.weight != 0).any()
+
+
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_identity_environment_is_learned(n_steps):
     env = DummyVecEnv([lambda: IdentityEnv(10)])
