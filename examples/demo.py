@@ -86,7 +86,14 @@ def draw(
         axis.grid(alpha=0.3)
         axis.axvline(learning_starts, color="0.4", linestyle=":")
     axes[-1].set_xlim(left=0)
-    axes[-1].annotate("learning starts ", (learning_starts, 0), (0, 4), textcoords="offset points", ha="right", color="0.4")
+    late = learning_starts > progress["time/total_timesteps"].max() / 2
+    place = {"textcoords": "offset points", "ha": "right" if late else "left", "color": "0.4", "fontsize": "small"}
+    axes[0].annotate(
+        "learning starts",
+        (learning_starts, axes[0].get_ylim()[0]),
+        (-4 if late else 4, 4),
+        **place,  # type: ignore[arg-type]
+    )
     beside = path.with_name(f".{path.name}")
     figure.savefig(beside, dpi=110, format="png")
     beside.replace(path)
