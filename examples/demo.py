@@ -31,7 +31,7 @@ LOSSES = {
     "train/get_loss": "GET loss",
     "train/reward_loss": "reward loss",
 }
-EVALUATION_SECONDS = 45  # kept free at the end of the minutes
+EVALUATION_SECONDS = 60  # kept free at the end of the minutes
 SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Table 5's 2,000 would be most of it
 
 
@@ -104,7 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--game", default="Pong")
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
-    parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--minutes", type=float, default=5.5)
     parser.add_argument("--eval-episodes", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path)
