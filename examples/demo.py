@@ -20,6 +20,7 @@ from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.envs import make_atari100k_env
+from sb3_eqr.envs.atari import atari_env_id
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -32,6 +33,7 @@ LOSSES = {
     "train/reward_loss": "reward loss",
 }
 EVALUATION_SECONDS = 60  # kept free at the end of the minutes
+CHECKPOINT_STEPS = 10_000
 SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Table 5's 2,000 would be most of it
 
 
@@ -43,6 +45,10 @@ class Demo(BaseCallback):
         self.log_every = log_every
         self.deadline = None if seconds is None else time.monotonic() + seconds
         self.scores: list[tuple[int, float]] = []  # (step, raw score of a whole game)
+
+    def _on_training_end(self) -> None:
+        if self.deadline is not None and time.monotonic() >= self.deadline:
+            print(f"stopped at {self.num_timesteps} steps: the time is over", flush=True)
 
     def _on_step(self) -> bool:
         self.scores += [(self.num_timesteps, info["episode"]["r"]) for info in self.locals["infos"] if "episode" in info]
@@ -64,9 +70,14 @@ def steps_that_fit(game: str, seconds: float) -> int:
 
 
 def draw(
-    progress: pd.DataFrame, scores: list[tuple[int, float]], learning_starts: int, title: str, path: pathlib.Path
+    progress: pd.DataFrame,
+    scores: list[tuple[int, float]],
+    evaluation: float,
+    learning_starts: int,
+    title: str,
+    path: pathlib.Path,
 ) -> None:
-    """One picture: the score of every game and the four losses over steps."""
+    """One picture: the score of every game, the evaluation at the end, and the four losses over steps."""
     figure, axes = plt.subplots(5, 1, figsize=(7, 11), sharex=True, layout="constrained")
     figure.suptitle(title)
     steps, raw = np.array(scores).reshape(-1, 2).T
@@ -74,11 +85,13 @@ def draw(
     if "rollout/ep_rew_mean" in progress:  # not before the first game is over
         means = progress.dropna(subset="rollout/ep_rew_mean")
         axes[0].plot(means["time/total_timesteps"], means["rollout/ep_rew_mean"], color="C0", label="mean of the last 100")
+    axes[0].plot(progress["time/total_timesteps"].max(), evaluation, "*", color="C3", markersize=10, label="evaluation")
     axes[0].set_ylabel("raw score")
     axes[0].legend(loc="best", fontsize="small")
     for axis, (key, name) in zip(axes[1:], LOSSES.items(), strict=True):
-        losses = progress.dropna(subset=key)
-        axis.plot(losses["time/total_timesteps"], losses[key], color="C1")
+        if key in progress:  # not before the first update
+            losses = progress.dropna(subset=key)
+            axis.plot(losses["time/total_timesteps"], losses[key], color="C1")
         axis.set_ylabel(name)
         axis.set_ylim(bottom=0)
     axes[-1].set_xlabel("steps")
@@ -109,7 +122,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
-    out = args.out or pathlib.Path("demo_results") / args.game
+    out = args.out or pathlib.Path("demo_results") / atari_env_id(args.game)[4:-3]
     settings: dict = {}
     seconds, start = None, time.monotonic()
     if args.steps is None:
@@ -121,8 +134,11 @@ def main() -> None:
     model = EqRQRDQN("CnnPolicy", make_atari100k_env(args.game, seed=args.seed), seed=args.seed, **settings)
     model.set_logger(configure(str(out), ["csv"]))
     demo = Demo(max(args.steps // 200, 20), None if seconds is None else seconds - (time.monotonic() - start))
-    checkpoints = CheckpointCallback(10_000, str(out / "checkpoints"), save_replay_buffer=True)
-    model.learn(args.steps, callback=[demo, checkpoints], progress_bar=True)
+    callbacks: list[BaseCallback] = [demo]
+    if args.steps > CHECKPOINT_STEPS:
+        callbacks.append(CheckpointCallback(CHECKPOINT_STEPS, str(out / "checkpoints"), save_replay_buffer=True))
+    (out / "training.png").unlink(missing_ok=True)  # of a run before
+    model.learn(args.steps, callback=callbacks, progress_bar=True)
     model.dump_logs()
     model.logger.close()
     model.save(out / "model")
@@ -131,7 +147,8 @@ def main() -> None:
     scores, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
     print(f"score of {len(scores)} games after {model.num_timesteps} steps: mean {np.mean(scores):.1f}, each {scores}")
     title = f"EqRQRDQN on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
-    draw(pd.read_csv(out / "progress.csv"), demo.scores, model.learning_starts, title, out / "training.png")
+    progress = pd.read_csv(out / "progress.csv")
+    draw(progress, demo.scores, float(np.mean(scores)), model.learning_starts, title, out / "training.png")
     print(f"{out}/model.zip, {out}/progress.csv, {out}/training.png; {(time.monotonic() - start) / 60:.1f} minutes")
 
 

@@ -27,6 +27,11 @@ def test_names_of_two_words_and_unknown_games():
     assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
     with pytest.raises(ValueError, match="did you mean Pong"):
         make_atari100k_env("Pnog")
+    for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # not this protocol
+        with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'Pong"):
+            make_atari100k_env(other)
+    with pytest.raises(ValueError, match="n_envs"):
+        make_atari100k_env("Pong", n_envs=0)
     with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'CartPole-v1'"):
         make_atari100k_env("CartPole-v1")
 

@@ -101,6 +101,13 @@ def test_wrong_action_spaces_are_refused(env):
         make(env)
 
 
+def test_actions_that_do_not_count_from_0_are_refused():
+    env = ChainEnv()
+    env.action_space = spaces.Discrete(3, start=1)
+    with pytest.raises(AssertionError, match="TransformAction"):
+        make(env)
+
+
 @pytest.mark.parametrize("n_envs", [2, 5])
 def test_several_environments(n_envs):
     model = make(make_vec_env(ChainEnv, n_envs), train_freq=2).learn(100)

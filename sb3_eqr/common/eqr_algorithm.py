@@ -120,10 +120,17 @@ class EqRAlgorithm(SafeFiles):
                 f"action, but {wrapped.action_space} was provided. Wrap the environment with discrete actions, "
                 "or use an algorithm for that space (SAC, TQC, PPO)."
             )
+        if wrapped.action_space.start != 0:
+            raise AssertionError(
+                f"The algorithm only supports actions that count from 0, but {wrapped.action_space} was provided. "
+                "Wrap the environment with gymnasium.wrappers.TransformAction."
+            )
         return wrapped
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        self._check_policy_and_spaces()
+        self._check_numbers()
+        self._check_replay_arguments()
         if self.env is not None:
             self.frame_stack = self._find_frame_stack()
         buffer_class = self.replay_buffer_class or (
@@ -146,7 +153,7 @@ class EqRAlgorithm(SafeFiles):
 
         if self.depth > 0 and self.get_coef > 0 and not self.policy.latent_model.group.has_inverse:
             raise ValueError(
-                f"get_coef: the GET loss needs a group with inverses, found {self.policy.latent_model.group}. "
+                f"get_coef: the GET loss needs a group with inverses, found group={self.policy.group!r}. "
                 "Pass get_coef=0 or another group."
             )
         if self._uses_aet and self.policy.shared_projection and not self.policy.online.net_arch:
@@ -171,13 +178,30 @@ class EqRAlgorithm(SafeFiles):
         image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
         self._augment = ImageAugmentation(image_keys, self.shift_pixels, self.intensity_scale)
 
-    def _check_arguments(self) -> None:
+    def _check_policy_and_spaces(self) -> None:
         base = self.policy_aliases["MlpPolicy"]
         if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, base)):
             raise ValueError(
                 f"{type(self).__name__}: expected a policy derived from {base.__name__}, found {self.policy_class}. "
                 f"Use one of {list(self.policy_aliases)}; a file is loaded by the class that saved it."
             )
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        if issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"]) and not is_dict:
+            raise ValueError(
+                f"MultiInputPolicy: expected a Dict observation space, found {self.observation_space}. "
+                "Use MlpPolicy for vectors, CnnPolicy for images."
+            )
+        normalize = self._vec_normalize_env
+        if normalize is not None and normalize.observation_space != self.observation_space:
+            raise ValueError(
+                f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
+                f"originals; found {normalize.observation_space} there, {self.observation_space} outside. "
+                "Use VecNormalize(VecTransposeImage(env)), for images."
+            )
+
+    def _check_numbers(self) -> None:
+        if self.target_update_interval is not None:
+            check_number("target_update_interval", self.target_update_interval, 1, whole=True)
         for name in ("prediction_depth", "shift_pixels"):
             check_number(name, getattr(self, name), 0, whole=True)
         for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
@@ -189,6 +213,8 @@ class EqRAlgorithm(SafeFiles):
                 f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
                 "Pass a larger batch_size or prediction_depth=0."
             )
+
+    def _check_replay_arguments(self) -> None:
         chosen = self.replay_buffer_class
         if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, SequenceReplayBuffer)):
             raise ValueError(
@@ -201,13 +227,6 @@ class EqRAlgorithm(SafeFiles):
                     f"replay_buffer_kwargs: expected arguments that {type(self).__name__} does not set itself, found "
                     f"{name!r}. Pass {argument}={self.replay_buffer_kwargs[name]!r} to {type(self).__name__}."
                 )
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.observation_space != self.observation_space:
-            raise ValueError(
-                f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
-                f"originals; found {normalize.observation_space} there, {self.observation_space} outside. "
-                "Use VecNormalize(VecTransposeImage(env)), for images."
-            )
 
     @property
     def depth(self) -> int:

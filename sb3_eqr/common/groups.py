@@ -254,6 +254,7 @@ class MatrixLieGroup(MatrixGroup):
         if basis.ndim != 3 or basis.shape[1] != basis.shape[2] or 0 in basis.shape or not basis.isfinite().all():
             raise ValueError(
                 f"generators: expected D >= 1 finite square matrices, shape (D, m, m), found shape {tuple(basis.shape)}"
+                f"{'' if basis.isfinite().all() else ' with entries that are not finite'}"
             )
         self.generators = basis
         checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups

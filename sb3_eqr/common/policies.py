@@ -64,6 +64,7 @@ class EqRPolicy(BasePolicy):
         reward_loss: str,
     ) -> None:
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
+        check_number("sigma_init", sigma_init, 0)
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization

@@ -41,9 +41,11 @@ def make_atari100k_env(
     :param monitor_dir: folder for ``Monitor``'s files
     :return: observations (84, 84, 4), uint8; SB3 transposes them
     :raises ImportError: without ale-py or OpenCV
-    :raises ValueError: for a game that there is not, with the nearest names
+    :raises ValueError: for a game that there is not, with the nearest names, or ``n_envs`` below 1
     """
     env_id = atari_env_id(game)
+    if n_envs < 1:
+        raise ValueError(f"n_envs: expected at least 1, found {n_envs}")
 
     def make_game() -> gym.Env:
         # Sticky actions, frame skip and frame limit of ALE itself off: the wrappers do what the protocol says.
@@ -80,7 +82,7 @@ def atari_env_id(game: str) -> str:
         raise ImportError('Atari needs ale-py and OpenCV: pip install "sb3-eqr[atari]"') from error
     gym.register_envs(ale_py)
     games = {name[4:-3].lower(): name for name in gym.registry if re.fullmatch(r"ALE/[A-Za-z]+[A-Za-z0-9]*-v5", name)}
-    bare = re.sub(r"^ALE/|(NoFrameskip|Deterministic)?-v\d$|[_ ]", "", game)
+    bare = re.sub(r"^ALE/|-v5$|NoFrameskip-v4$|[_ ]", "", game)
     if bare.lower() not in games:
         near = difflib.get_close_matches(bare.lower(), games, n=3)
         hint = f"did you mean {', '.join(games[name][4:-3] for name in near)}?" if near else "see gymnasium.registry"
