@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
-from sb3_eqr import EqRQRDQN, PrioritizedSequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 
 SIZE = 84
 N_STACK = 4
@@ -119,9 +119,9 @@ def bytes_per_transition(models: dict[str, OffPolicyAlgorithm]) -> dict[str, flo
     return found
 
 
-def measure_sampling(sizes: tuple[int, ...], rounds: int) -> dict[int, float]:
+def measure_sampling(sizes: tuple[int, ...], rounds: int) -> dict[str, dict[int, float]]:
     """
-    :return: median milliseconds of a prioritised sample and the update of its priorities, per number of stored transitions
+    :return: median milliseconds of a sample, per way of drawing and number of stored transitions
     """
     n_envs = 20
     space = spaces.Box(0, 255, (N_STACK, SIZE, SIZE), np.uint8)
@@ -132,13 +132,16 @@ def measure_sampling(sizes: tuple[int, ...], rounds: int) -> dict[int, float]:
         )
         fill(buffers[size], size // n_envs, n_envs)
     priorities = th.rand(BATCH_SIZE)
-    timings: dict[int, list[float]] = {size: [] for size in sizes}
+    ways: dict[str, Callable[[PrioritizedSequenceReplayBuffer], object]] = {
+        "prioritised, priorities updated": lambda b: b.update_priorities(b.sample(BATCH_SIZE).indices, priorities),
+        "uniform, from the same storage": lambda b: SequenceReplayBuffer.sample(b, BATCH_SIZE),
+    }
+    timings: dict[str, dict[int, list[float]]] = {way: {size: [] for size in sizes} for way in ways}
     for _ in range(rounds):
-        for size, buffer in buffers.items():
-            timings[size].append(
-                milliseconds(lambda: buffer.update_priorities(buffer.sample(BATCH_SIZE).indices, priorities), 10)  # noqa: B023
-            )
-    return {size: float(np.median(values)) for size, values in timings.items()}
+        for way, call in ways.items():
+            for size, buffer in buffers.items():
+                timings[way][size].append(milliseconds(lambda: call(buffer), 30))  # noqa: B023
+    return {way: {size: float(np.median(t)) for size, t in row.items()} for way, row in timings.items()}
 
 
 def main() -> None:
@@ -175,8 +178,8 @@ def main() -> None:
     result: dict = {"threads": args.threads, "rounds": args.rounds, "torch": th.__version__, "models": figures}
     if args.large:
         result["sampling_ms"] = measure_sampling((10_000, 1_000_000), args.rounds)
-        small, large = result["sampling_ms"].values()
-        print(f"prioritised sample and update: {small:.2f} ms at 10,000 stored, {large:.2f} ms at 1,000,000")
+        for way, row in result["sampling_ms"].items():
+            print(f"sample, {way}: " + ", ".join(f"{ms:.2f} ms at {size:,} stored" for size, ms in row.items()))
     if args.json:
         with open(args.json, "w") as file:
             json.dump(result, file, indent=2)
