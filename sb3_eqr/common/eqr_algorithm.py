@@ -1,27 +1,18 @@
 """The one training loop of every EqR agent (Algorithm 1)."""
 
-import io
-import pathlib
-import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
 from sb3_eqr.common.augmentations import ImageAugmentation
-from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-from sb3_eqr.common.checks import check_finite, check_number
-from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.safe_files import SafeFiles
+from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer
+from sb3_eqr.common.eqr_setup import EqRSetup
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
@@ -36,18 +27,10 @@ class TDLoss(NamedTuple):
     q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
 
 
-# What of the replay buffer is set by an argument of the algorithm, which may move it later.
-BUFFER_ARGUMENTS = {
-    "n_steps": "n_steps",
-    "gamma": "gamma",
-    "prediction_depth": "prediction_depth",
-    "alpha": "priority_alpha",
-    "beta": "priority_beta",
-}
 METRICS = ("td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value")
 
 
-class EqRAlgorithm(SafeFiles):
+class EqRAlgorithm(EqRSetup):
     """
     Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
     one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
@@ -55,117 +38,8 @@ class EqRAlgorithm(SafeFiles):
     For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
     """
 
-    policy: EqRPolicy
-    replay_buffer: SequenceReplayBuffer | None
-    replay_buffer_class: type[SequenceReplayBuffer] | None
-    target_update_interval: int | None
-    max_grad_norm: float | None
-    exploration_schedule: Schedule
-    exploration_rate: float
-    exploration_final_eps: float
-    _n_calls: int
-
-    def __init__(
-        self,
-        policy: str | type[EqRPolicy],
-        env: GymEnv | str,
-        *,
-        prediction_depth: int,
-        aet_coef: float,
-        get_coef: float,
-        reward_coef: float,
-        reward_loss: str,
-        double_q: bool,
-        prioritized_replay: bool,
-        priority_alpha: float,
-        priority_beta: float,
-        shift_pixels: int,
-        intensity_scale: float,
-        policy_kwargs: dict[str, Any] | None,
-        replay_buffer_kwargs: dict[str, Any] | None,
-        **base_kwargs: Any,
-    ):
-        # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
-        policy_kwargs = dict(policy_kwargs or {})
-        if "optimizer_class" not in policy_kwargs:
-            policy_kwargs["optimizer_class"] = th.optim.Adam
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **(policy_kwargs.get("optimizer_kwargs") or {})}  # Table 5
-        super().__init__(
-            policy,
-            env,
-            policy_kwargs=policy_kwargs,
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
-            _init_setup_model=False,  # type: ignore[call-arg]
-            **base_kwargs,
-        )
-        self.prediction_depth = prediction_depth
-        self.aet_coef = aet_coef
-        self.get_coef = get_coef
-        self.reward_coef = reward_coef
-        self.reward_loss = reward_loss
-        self.double_q = double_q
-        self.prioritized_replay = prioritized_replay
-        self.priority_alpha = priority_alpha
-        self.priority_beta = priority_beta
-        self.shift_pixels = shift_pixels
-        self.intensity_scale = intensity_scale
-        self.frame_stack = 1
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if not isinstance(wrapped.action_space, spaces.Discrete):
-            raise AssertionError(  # SB3's type for an unsupported action space
-                f"The algorithm only supports {spaces.Discrete} as action space, because the Q head has one output per "
-                f"action, but {wrapped.action_space} was provided. Wrap the environment with discrete actions, "
-                "or use an algorithm for that space (SAC, TQC, PPO)."
-            )
-        if wrapped.action_space.start != 0:
-            raise AssertionError(
-                f"The algorithm only supports actions that count from 0, but {wrapped.action_space} was provided. "
-                "Wrap the environment with gymnasium.wrappers.TransformAction."
-            )
-        return wrapped
-
     def _setup_model(self) -> None:
-        self._check_policy_and_spaces()
-        self._check_numbers()
-        self._check_replay_arguments()
-        if self.env is not None:
-            self.frame_stack = self._find_frame_stack()
-        buffer_class = self.replay_buffer_class or (
-            PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
-        )
-        if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer(buffer_class)
-        # SB3's set-up rejects n-step Dict replay, knows no target per gradient step and no latent model:
-        # it is shown values that it can take, and gets the true ones back.
-        shown = {
-            "n_steps": 1,
-            "replay_buffer_class": buffer_class,
-            "target_update_interval": self.target_update_interval or self.n_envs,
-            "policy_kwargs": {**self.policy_kwargs, "reward_loss": self.reward_loss},
-        }
-        true = {name: getattr(self, name) for name in shown}
-        self.__dict__.update(shown)
         super()._setup_model()
-        self.__dict__.update(true)
-
-        if self.depth > 0 and self.get_coef > 0 and not self.policy.latent_model.group.has_inverse:
-            raise ValueError(
-                f"get_coef: the GET loss needs a group with inverses, found group={self.policy.group!r}. "
-                "Pass get_coef=0 or another group."
-            )
-        if self._uses_aet and self.policy.shared_projection and not self.policy.online.net_arch:
-            raise ValueError(
-                "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
-                'Pass policy_kwargs={"net_arch": [256]} or {"shared_projection": False}, or aet_coef=0.'
-            )
-        if self.exploration_final_eps == 0 and not self.policy.noisy:
-            warnings.warn(
-                "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
-                "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
-            )
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         encoder_modules = self.policy.online.features_extractor.modules()
         depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd)
@@ -178,89 +52,10 @@ class EqRAlgorithm(SafeFiles):
         image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
         self._augment = ImageAugmentation(image_keys, self.shift_pixels, self.intensity_scale)
 
-    def _check_policy_and_spaces(self) -> None:
-        base = self.policy_aliases["MlpPolicy"]
-        if not (isinstance(self.policy_class, type) and issubclass(self.policy_class, base)):
-            raise ValueError(
-                f"{type(self).__name__}: expected a policy derived from {base.__name__}, found {self.policy_class}. "
-                f"Use one of {list(self.policy_aliases)}; a file is loaded by the class that saved it."
-            )
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        if issubclass(self.policy_class, self.policy_aliases["MultiInputPolicy"]) and not is_dict:
-            raise ValueError(
-                f"MultiInputPolicy: expected a Dict observation space, found {self.observation_space}. "
-                "Use MlpPolicy for vectors, CnnPolicy for images."
-            )
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.observation_space != self.observation_space:
-            raise ValueError(
-                f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
-                f"originals; found {normalize.observation_space} there, {self.observation_space} outside. "
-                "Use VecNormalize(VecTransposeImage(env)), for images."
-            )
-
-    def _check_numbers(self) -> None:
-        if self.target_update_interval is not None:
-            check_number("target_update_interval", self.target_update_interval, 1, whole=True)
-        for name in ("prediction_depth", "shift_pixels"):
-            check_number(name, getattr(self, name), 0, whole=True)
-        for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
-            check_number(name, getattr(self, name), 0)
-        check_number("tau", self.tau, 0, 1)
-        check_number("batch_size", self.batch_size, 1, whole=True)
-        if self.depth > 0 and self.batch_size < 2:
-            raise ValueError(
-                f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
-                "Pass a larger batch_size or prediction_depth=0."
-            )
-
-    def _check_replay_arguments(self) -> None:
-        chosen = self.replay_buffer_class
-        if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, SequenceReplayBuffer)):
-            raise ValueError(
-                f"replay_buffer_class: expected SequenceReplayBuffer or a class derived from it, found {chosen}. "
-                "Leave it out to get the one that prioritized_replay asks for."
-            )
-        for name, argument in BUFFER_ARGUMENTS.items():
-            if name in self.replay_buffer_kwargs:
-                raise ValueError(
-                    f"replay_buffer_kwargs: expected arguments that {type(self).__name__} does not set itself, found "
-                    f"{name!r}. Pass {argument}={self.replay_buffer_kwargs[name]!r} to {type(self).__name__}."
-                )
-
-    @property
-    def depth(self) -> int:
-        """M as it is used: 0 where no auxiliary loss is on."""
-        return self.prediction_depth if self.aet_coef or self.get_coef or self.reward_coef else 0
-
-    @property
-    def _uses_aet(self) -> bool:
-        return self.depth > 0 and self.aet_coef > 0
-
     @property
     def _target_is_online(self) -> bool:
         """Whether target features are online features, so that one pass serves for both."""
         return self._target_is_copy and self._encoder_ignores_mode
-
-    def _find_frame_stack(self) -> int:
-        found = 1
-        stack = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
-        if isinstance(stack, VecFrameStack) and is_image_space(self.observation_space):
-            # Frames lie side by side along the first axis only if channels were what was stacked.
-            channels_first = is_image_space_channels_first(stack.venv.observation_space)  # type: ignore[arg-type]
-            if stack.stacked_obs.channels_first == channels_first:
-                found = stack.stacked_obs.n_stack
-        return self.replay_buffer_kwargs.get("frame_stack", found)
-
-    def _make_replay_buffer(self, buffer_class: type[SequenceReplayBuffer]) -> SequenceReplayBuffer:
-        kwargs: dict[str, Any] = {"n_steps": self.n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
-        if issubclass(buffer_class, PrioritizedSequenceReplayBuffer):
-            kwargs.update(alpha=self.priority_alpha, beta=self.priority_beta)
-        kwargs.update(self.replay_buffer_kwargs)
-        kwargs["frame_stack"] = self.frame_stack
-        return buffer_class(
-            self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
-        )
 
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
@@ -375,32 +170,6 @@ class EqRAlgorithm(SafeFiles):
         :param next_target: the same from the target, (B, D)
         """
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        result = super()._setup_learn(*args, **kwargs)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
-        return result
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
-        normalize, step = self._vec_normalize_env, self.num_timesteps
-        try:
-            check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
-            check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
-            for info in infos:
-                check_finite("terminal observation", info.get("terminal_observation", 0), step)
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        except ValueError:
-            self._last_obs = None  # the environment has moved on: another call of learn must reset it
-            raise
-
     def learn(
         self: SelfEqRAlgorithm,
         total_timesteps: int,
@@ -437,21 +206,8 @@ class EqRAlgorithm(SafeFiles):
         self._target_is_copy = False  # nothing is known of them
         super().set_parameters(load_path_or_dict, exact_match, device)
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        As SB3's ``save``, see :meth:`SafeFiles.save`. A model whose last update went wrong is put back and not saved.
-
-        :param path: path to the file, or a file-like
-        :param exclude: names of attributes to leave out beside the default ones
-        :param include: names of attributes to save although they are left out by default
-        """
-        self._collect_metrics()
-        super().save(path, exclude, include)
+    def _before_saving(self) -> None:
+        self._collect_metrics()  # a model whose last update went wrong is put back and not saved
 
     def _excluded_save_params(self) -> list[str]:
         return [

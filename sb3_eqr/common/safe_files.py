@@ -99,12 +99,16 @@ class SafeFiles(OffPolicyAlgorithm):
         :param exclude: names of attributes to leave out beside the default ones
         :param include: names of attributes to save although they are left out by default
         """
+        self._before_saving()
         self.rng_state = get_rng_state(self.action_space)
         if not isinstance(path, (str, pathlib.Path)):
             super().save(path, exclude, include)
             return
         with atomic_write(path, "zip") as file:
             super().save(file, exclude, include)  # type: ignore[arg-type]
+
+    def _before_saving(self) -> None:
+        """Called before a model is written; an exception keeps the old file."""
 
     @classmethod
     def load(
