@@ -34,8 +34,6 @@ class EqRAlgorithm(EqRSetup):
     """
     Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
     one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
-
-    For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
     """
 
     def _setup_model(self) -> None:
@@ -132,7 +130,7 @@ class EqRAlgorithm(EqRSetup):
             next_target = next_online = other_features[:batch_size]
             if self.double_q and not self._target_is_online:
                 next_online = policy.online.features(_map(lambda obs: obs[:batch_size], other_observations))
-        td = self._td_loss(samples, features, next_online, next_target)
+        td = self._q_learning(samples, features, next_online, next_target)
         if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
@@ -153,21 +151,38 @@ class EqRAlgorithm(EqRSetup):
         )
         return td, auxiliary
 
-    @abstractmethod
-    def _td_loss(
-        self,
-        samples: SequenceReplayBufferSamples,
-        features: th.Tensor,
-        next_online: th.Tensor,
-        next_target: th.Tensor,
+    def _q_learning(
+        self, samples: SequenceReplayBufferSamples, features: th.Tensor, next_online: th.Tensor, next_target: th.Tensor
     ) -> TDLoss:
         """
-        The Q head's own loss.
-
         :param samples: the batch
         :param features: of s_t, online, (B, D)
         :param next_online: of the n-step transition's last observation, online, no gradient, (B, D): double Q chooses by it
         :param next_target: the same from the target, (B, D)
+        """
+        online, target = self.policy.online, self.policy.target
+        with th.no_grad():
+            next_outputs = target.head(next_target, noisy=True)  # (B, N, A)
+            chooser = online.head(next_online, noisy=True) if self.double_q else next_outputs
+            next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
+            following = _of_actions(next_outputs, next_actions)  # (B, N)
+            discounts = (1 - samples.dones) * samples.discounts  # (B, 1)
+        current = _of_actions(online.head(features, noisy=True), samples.actions.long())  # (B, N)
+        loss, priorities = self._td_loss(current, following, samples.rewards, discounts)
+        return TDLoss(loss, priorities, online.expectation(current.detach()))
+
+    @abstractmethod
+    def _td_loss(
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The Q head's own loss.
+
+        :param current: outputs of the online head for (s_t, a_t), (B, N)
+        :param following: those of the target head after the n-step transition, for the best action, no gradient, (B, N)
+        :param rewards: the n-step return, (B, 1)
+        :param discounts: 0 where the transition ended in a terminal state, γ to its length elsewhere, (B, 1)
+        :return: loss, (B,), and priorities ≥ 0 without gradient, (B,)
         """
 
     def learn(
@@ -175,11 +190,12 @@ class EqRAlgorithm(EqRSetup):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
-        tb_log_name: str = "EqR",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfEqRAlgorithm:
-        """As SB3's ``learn``, with the same parameters."""
+        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
+        tb_log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._collect_metrics()
         return self
@@ -218,6 +234,15 @@ class EqRAlgorithm(EqRSetup):
             "_target_is_copy",
             "_augment",
         ]
+
+
+def _of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    :param outputs: of a head, (B, N, A)
+    :param actions: (B, 1), int64
+    :return: (B, N)
+    """
+    return outputs.gather(dim=2, index=actions[..., None].expand(-1, outputs.shape[1], 1)).squeeze(dim=2)
 
 
 def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:

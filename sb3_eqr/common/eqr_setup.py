@@ -1,21 +1,19 @@
-"""What an EqR agent is made of: arguments checked, replay buffer and policy built."""
+"""What an EqR agent is made of: environment, replay buffer and policy, checked and built."""
 
 import warnings
 from typing import Any
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-from sb3_eqr.common.checks import check_finite, check_number
-from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.safe_files import SafeFiles
+from sb3_eqr.common.checks import check_finite
+from sb3_eqr.common.eqr_arguments import EqRArguments
 
 # What of the replay buffer is set by an argument of the algorithm, which may move it later.
 BUFFER_ARGUMENTS = {
@@ -27,69 +25,13 @@ BUFFER_ARGUMENTS = {
 }
 
 
-class EqRSetup(SafeFiles):
+class EqRSetup(EqRArguments):
     """
-    Mixin, to stand before an SB3 Q-learning algorithm: its environment, its arguments, its replay buffer and its policy.
+    Mixin, to stand before an SB3 Q-learning algorithm: its environment, its replay buffer and its policy.
     :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` adds the training loop.
-
-    For the parameters see :class:`~sb3_eqr.EqRQRDQN`, whose signature holds the defaults.
     """
 
-    policy: EqRPolicy
-    replay_buffer: SequenceReplayBuffer | None
-    replay_buffer_class: type[SequenceReplayBuffer] | None
-    target_update_interval: int | None
-    max_grad_norm: float | None
-    exploration_schedule: Schedule
-    exploration_rate: float
-    exploration_final_eps: float
-    _n_calls: int
-
-    def __init__(
-        self,
-        policy: str | type[EqRPolicy],
-        env: GymEnv | str,
-        *,
-        prediction_depth: int,
-        aet_coef: float,
-        get_coef: float,
-        reward_coef: float,
-        reward_loss: str,
-        double_q: bool,
-        prioritized_replay: bool,
-        priority_alpha: float,
-        priority_beta: float,
-        shift_pixels: int,
-        intensity_scale: float,
-        policy_kwargs: dict[str, Any] | None,
-        replay_buffer_kwargs: dict[str, Any] | None,
-        **base_kwargs: Any,
-    ):
-        # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
-        policy_kwargs = dict(policy_kwargs or {})
-        if "optimizer_class" not in policy_kwargs:
-            policy_kwargs["optimizer_class"] = th.optim.Adam
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **(policy_kwargs.get("optimizer_kwargs") or {})}  # Table 5
-        super().__init__(
-            policy,
-            env,
-            policy_kwargs=policy_kwargs,
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
-            _init_setup_model=False,  # type: ignore[call-arg]
-            **base_kwargs,
-        )
-        self.prediction_depth = prediction_depth
-        self.aet_coef = aet_coef
-        self.get_coef = get_coef
-        self.reward_coef = reward_coef
-        self.reward_loss = reward_loss
-        self.double_q = double_q
-        self.prioritized_replay = prioritized_replay
-        self.priority_alpha = priority_alpha
-        self.priority_beta = priority_beta
-        self.shift_pixels = shift_pixels
-        self.intensity_scale = intensity_scale
-        self.frame_stack = 1
+    frame_stack = 1
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -168,21 +110,6 @@ class EqRSetup(SafeFiles):
                 "Use VecNormalize(VecTransposeImage(env)), for images."
             )
 
-    def _check_numbers(self) -> None:
-        if self.target_update_interval is not None:
-            check_number("target_update_interval", self.target_update_interval, 1, whole=True)
-        for name in ("prediction_depth", "shift_pixels"):
-            check_number(name, getattr(self, name), 0, whole=True)
-        for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
-            check_number(name, getattr(self, name), 0)
-        check_number("tau", self.tau, 0, 1)
-        check_number("batch_size", self.batch_size, 1, whole=True)
-        if self.depth > 0 and self.batch_size < 2:
-            raise ValueError(
-                f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "
-                "Pass a larger batch_size or prediction_depth=0."
-            )
-
     def _check_replay_arguments(self) -> None:
         chosen = self.replay_buffer_class
         if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, SequenceReplayBuffer)):
@@ -196,15 +123,6 @@ class EqRSetup(SafeFiles):
                     f"replay_buffer_kwargs: expected arguments that {type(self).__name__} does not set itself, found "
                     f"{name!r}. Pass {argument}={self.replay_buffer_kwargs[name]!r} to {type(self).__name__}."
                 )
-
-    @property
-    def depth(self) -> int:
-        """M as it is used: 0 where no auxiliary loss is on."""
-        return self.prediction_depth if self.aet_coef or self.get_coef or self.reward_coef else 0
-
-    @property
-    def _uses_aet(self) -> bool:
-        return self.depth > 0 and self.aet_coef > 0
 
     def _find_frame_stack(self) -> int:
         found = 1

@@ -1,31 +1,76 @@
 """What every EqR policy adds to an SB3 Q-learning policy."""
 
+from abc import abstractmethod
 from copy import deepcopy
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
 from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.features_extractor import ConvExtractor, GroupFeaturesExtractor
+from sb3_eqr.common.features_extractor import DEFAULT_GROUP, ConvExtractor, GroupFeaturesExtractor
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
 from sb3_eqr.common.layers import DistributionalHead
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 Module = TypeVar("Module", bound=nn.Module)
+Network = TypeVar("Network", bound="EqRNetwork")
+
+DEFAULT_NET_ARCH = (256,)  # appendix B.4
 
 
 class EqRNetwork(BasePolicy):
-    """A features extractor and a distributional head; what online and target networks have in common."""
+    """
+    A features extractor and a distributional head: an online or a target network.
 
-    head: DistributionalHead
-    net_arch: list[int]
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param features_extractor: the group encoder
+    :param features_dim: D
+    :param net_arch: hidden sizes of the head
+    :param activation_fn: Activation function of the head
+    :param normalize_images: Whether to divide images by 255
+    :param n_atoms: N, how many numbers the head has per action: quantiles or atoms
+    :param dueling: whether the head splits value from advantage
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Discrete,
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module],
+        normalize_images: bool,
+        n_atoms: int,
+        dueling: bool,
+        sigma_init: float | None,
+    ):
+        # Not the constructor of the stock network beside it: that would build a head that is thrown away.
+        BasePolicy.__init__(
+            self,
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+        )
+        self.net_arch = net_arch
+        self.activation_fn = activation_fn
+        self.features_dim = features_dim
+        self.n_atoms = n_atoms
+        self.dueling = dueling
+        self.sigma_init = sigma_init
+        self.head = DistributionalHead(
+            features_dim, int(action_space.n), n_atoms, net_arch, activation_fn, dueling, sigma_init
+        )
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -34,6 +79,29 @@ class EqRNetwork(BasePolicy):
         """
         return self.extract_features(obs, self.features_extractor)
 
+    @abstractmethod
+    def expectation(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: of the head, (B, N, A), or those of one action, (B, N)
+        :return: Q values, (B, A), or (B,)
+        """
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        outputs = self.head(self.features(observation), noisy=not deterministic)
+        return self.expectation(outputs).argmax(dim=1)  # (B,)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **BasePolicy._get_constructor_parameters(self),
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "net_arch": self.net_arch,
+            "activation_fn": self.activation_fn,
+            "n_atoms": self.n_atoms,
+            "dueling": self.dueling,
+            "sigma_init": self.sigma_init,
+        }
+
 
 class EqRPolicy(BasePolicy):
     """
@@ -41,28 +109,64 @@ class EqRPolicy(BasePolicy):
     It puts the group encoder behind the policy's features extractor, and adds the latent model, its target copy,
     its parameter group and its train mode.
 
-    A subclass calls :meth:`_configure` before its base's constructor (which builds), and defines ``online`` and ``target``.
+    A subclass defines ``online`` and ``target``. The parameters up to ``optimizer_kwargs`` are those of SB3's policies.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: hidden sizes of the Q head; ``None``: [256] (appendix B.4)
+    :param activation_fn: Activation function of the Q head
+    :param features_extractor_class: the trunk; the group encoder is put behind it. ``None``: SB3's ``FlattenExtractor``
+        (MlpPolicy), the paper's three convolutions (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
+    :param features_extractor_kwargs: its keyword arguments
+    :param normalize_images: Whether to divide images by 255 (True by default)
+    :param optimizer_class: The optimizer to use, Adam by default
+    :param optimizer_kwargs: its keyword arguments, excluding the learning rate
+    :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
+        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
+    :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
+    :param parameterization: of rotations, "euler" or "exp"
+    :param dueling: value and advantage streams
+    :param noisy: factorised noisy layers in the head
+    :param sigma_init: their initial noise σ₀
+    :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
+    :param shared_projection: whether the AET loss projects with the first layer of the Q head; else with a layer of its own
+    :param reward_loss: set by the algorithm, see there
+    :param stock_kwargs: what else the stock policy takes
+    :raises ValueError: for an argument out of its range
     """
 
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     action_space: spaces.Discrete
+    net_arch: list[int]
     latent_model: LatentModel
     latent_model_target: LatentModel
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
 
-    def _configure(
+    def __init__(
         self,
-        *,
-        group: str | Group | None,
-        n_blocks: int | None,
-        parameterization: str,
-        latent_hidden_dim: int,
-        dueling: bool,
-        noisy: bool,
-        sigma_init: float,
-        shared_projection: bool,
-        reward_loss: str,
-    ) -> None:
+        observation_space: spaces.Space,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule,
+        net_arch: list[int] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        group: str | Group | None = DEFAULT_GROUP,
+        n_blocks: int | None = None,
+        parameterization: str = "euler",
+        dueling: bool = True,
+        noisy: bool = True,
+        sigma_init: float = 0.5,
+        latent_hidden_dim: int = 256,
+        shared_projection: bool = True,
+        reward_loss: str = "mse",
+        **stock_kwargs: Any,
+    ):
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         check_number("sigma_init", sigma_init, 0)
         self.group = group
@@ -74,6 +178,19 @@ class EqRPolicy(BasePolicy):
         self.sigma_init = sigma_init
         self.shared_projection = shared_projection
         self.reward_loss = reward_loss
+        super().__init__(  # builds
+            observation_space,
+            action_space,
+            lr_schedule,  # type: ignore[arg-type]
+            net_arch=list(DEFAULT_NET_ARCH) if net_arch is None else net_arch,
+            activation_fn=activation_fn,
+            features_extractor_class=features_extractor_class or self.default_trunk_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            **stock_kwargs,
+        )
 
     @property
     def online(self) -> EqRNetwork:
@@ -106,6 +223,20 @@ class EqRPolicy(BasePolicy):
             trunk_class=self.features_extractor_class,
             trunk_kwargs=trunk_kwargs,
         )
+
+    def _make_network(self, network_class: type[Network], n_atoms: int, **kwargs: Any) -> Network:
+        network_args: dict[str, Any] = {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "net_arch": self.net_arch,
+            "activation_fn": self.activation_fn,
+            "normalize_images": self.normalize_images,
+            "n_atoms": n_atoms,
+            "dueling": self.dueling,
+            "sigma_init": self.sigma_init if self.noisy else None,
+        }
+        network_args = self._update_features_extractor(network_args, features_extractor=None)
+        return network_class(**network_args, **kwargs).to(self.device)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # type: ignore[misc]

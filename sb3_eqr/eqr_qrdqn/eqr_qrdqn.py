@@ -1,14 +1,11 @@
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch as th
 from sb3_contrib.qrdqn import QRDQN
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm, TDLoss
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.losses import quantile_huber_loss
-from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, EqRQuantileNetwork, MlpPolicy, MultiInputPolicy
 
 
@@ -17,56 +14,13 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     Equivariant representations for RL (EqR) on Quantile Regression DQN.
     Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
     the quantile head is of https://arxiv.org/abs/1710.10044.
-    Default hyperparameters are those of the paper for Atari 100K (Table 5). They deviate where QR-DQN does: 51 quantiles
-    stand in for 51 atoms on [-10, 10], and the priority of a sample is its quantile loss.
+
+    The parameters are those of :class:`~sb3_eqr.common.eqr_arguments.EqRArguments` (``help(EqRQRDQN.__init__)``), with
+    the values of the paper for Atari 100K (Table 5) as defaults. They deviate where QR-DQN does: 51 quantiles stand in
+    for 51 atoms on [-10, 10], and the priority of a sample is its quantile loss.
 
     Group, number of blocks, dueling and noisy layers are set by ``policy_kwargs``, see
     :class:`~sb3_eqr.eqr_qrdqn.policies.EqRQRDQNPolicy`.
-
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
-    :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
-    :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
-    :param buffer_size: size of the replay buffer, over all environments; per environment at least n + M + 1
-    :param learning_starts: how many steps of the model to collect transitions for before learning starts
-    :param batch_size: Minibatch size for each gradient update
-    :param tau: how far the target moves at each target update, in [0, 1]; 1 copies the online networks
-    :param gamma: the discount factor
-    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
-        like ``(5, "step")`` or ``(2, "episode")``.
-    :param gradient_steps: How many gradient steps to do after each rollout; -1: as many as steps done in the environment
-    :param replay_buffer_class: a class derived from ``SequenceReplayBuffer``; ``None``: chosen by ``prioritized_replay``
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation; ``frame_stack`` tells how many
-        frames an image observation stacks (found by itself where ``VecFrameStack`` is used)
-    :param optimize_memory_usage: has no effect: memory is always saved
-    :param n_steps: n of the n-step return
-    :param target_update_interval: update the target every so many environment steps, as QRDQN does;
-        ``None``: after every gradient step, as the paper asks
-    :param exploration_fraction: fraction of entire training period over which the exploration rate is reduced;
-        2,000 of 100,000 steps, after which the noisy layers explore
-    :param exploration_initial_eps: initial value of random action probability
-    :param exploration_final_eps: final value of random action probability
-    :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
-    :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
-    :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss; 0 switches it off
-    :param get_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
-    :param reward_coef: λ₁ ≥ 0, weight of the reward loss; 0 switches it off
-    :param reward_loss: "mse" (Eq. 17), or "categorical": cross-entropy over the sign of the reward
-    :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
-    :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
-    :param priority_alpha: α, the priority exponent
-    :param priority_beta: β at the start of training; it is annealed to 1
-    :param shift_pixels: random shift of images, in pixels; 0 switches it off
-    :param intensity_scale: random intensity of images; 0 switches it off
-    :param stats_window_size: Window size for the rollout logging
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation
-    :param verbose: the verbosity level: 0 no output, 1 info, 2 debug
-    :param seed: Seed for the pseudo random generators
-    :param device: Device (cpu, cuda, ...) on which the code should be run.
-        Setting it to auto, the code will be run on the GPU if possible.
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
-    :raises ValueError: for an argument out of its range
-    :raises AssertionError: if the action space is not Discrete (as SB3)
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -79,120 +33,8 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     quantile_net_target: EqRQuantileNetwork
     target_update_interval: int | None  # type: ignore[assignment]
 
-    def __init__(
-        self,
-        policy: str | type[EqRQRDQNPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-4,
-        buffer_size: int = 100_000,
-        learning_starts: int = 2_000,
-        batch_size: int = 32,
-        tau: float = 1.0,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 2,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 10,
-        target_update_interval: int | None = None,
-        exploration_fraction: float = 0.02,
-        exploration_initial_eps: float = 1.0,
-        exploration_final_eps: float = 0.0,
-        max_grad_norm: float | None = 10.0,
-        prediction_depth: int = 5,
-        aet_coef: float = 1.0,
-        get_coef: float = 1.0,
-        reward_coef: float = 1.0,
-        reward_loss: str = "mse",
-        double_q: bool = True,
-        prioritized_replay: bool = True,
-        priority_alpha: float = 0.5,
-        priority_beta: float = 0.4,
-        shift_pixels: int = 4,
-        intensity_scale: float = 0.05,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
-    ):
-        del optimize_memory_usage  # kept so that QRDQN's arguments fit
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            n_steps=n_steps,
-            target_update_interval=target_update_interval,
-            exploration_fraction=exploration_fraction,
-            exploration_initial_eps=exploration_initial_eps,
-            exploration_final_eps=exploration_final_eps,
-            max_grad_norm=max_grad_norm,
-            prediction_depth=prediction_depth,
-            aet_coef=aet_coef,
-            get_coef=get_coef,
-            reward_coef=reward_coef,
-            reward_loss=reward_loss,
-            double_q=double_q,
-            prioritized_replay=prioritized_replay,
-            priority_alpha=priority_alpha,
-            priority_beta=priority_beta,
-            shift_pixels=shift_pixels,
-            intensity_scale=intensity_scale,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-        )
-        if _init_setup_model:
-            self._setup_model()
-
     def _td_loss(
-        self,
-        samples: SequenceReplayBufferSamples,
-        features: th.Tensor,
-        next_online: th.Tensor,
-        next_target: th.Tensor,
-    ) -> TDLoss:
-        with th.no_grad():
-            next_quantiles = self.quantile_net_target.head(next_target, noisy=True)  # (B, N, A)
-            chooser = self.quantile_net.head(next_online, noisy=True) if self.double_q else next_quantiles
-            next_actions = chooser.mean(dim=1, keepdim=True).argmax(dim=2, keepdim=True)  # (B, 1, 1)
-            next_quantiles = _of_actions(next_quantiles, next_actions)  # (B, N)
-            target = samples.rewards + (1 - samples.dones) * samples.discounts * next_quantiles
-        current = _of_actions(self.quantile_net.head(features, noisy=True), samples.actions[..., None].long())
-        loss = quantile_huber_loss(current, target)
-        return TDLoss(loss, loss.detach(), current.detach().mean(dim=1))
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "EqRQRDQN",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> "EqRQRDQN":
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-
-def _of_actions(quantiles: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    :param quantiles: (B, N, A)
-    :param actions: (B, 1, 1), int64
-    :return: (B, N)
-    """
-    return quantiles.gather(dim=2, index=actions.expand(-1, quantiles.shape[1], 1)).squeeze(dim=2)
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        loss = quantile_huber_loss(current, rewards + discounts * following)
+        return loss, loss.detach()
