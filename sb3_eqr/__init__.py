@@ -4,11 +4,13 @@ from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceRepl
 from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
+from sb3_eqr.eqr_rainbow import EqRRainbow
 
 __version__ = "0.1.0"
 
 __all__ = [
     "EqRQRDQN",
+    "EqRRainbow",
     "GroupFeaturesExtractor",
     "MatrixLieGroup",
     "PrioritizedSequenceReplayBuffer",

@@ -1,3 +1,12 @@
+import pytest
 import torch as th
 
+from tests.models import MAKERS
+
 th.set_num_threads(1)  # small networks are slower on two threads, and xdist runs two tests at once
+
+
+@pytest.fixture(params=MAKERS, ids=lambda maker: maker.algorithm.__name__)
+def make(request):
+    """What makes small agents, of each algorithm in turn."""
+    return request.param

@@ -1,7 +1,7 @@
 """
 One half of the resuming test, run as a program of its own: load what the other half saved, go on, save.
 
-    python -m tests.resume FOLDER STEPS
+    python -m tests.resume ALGORITHM FOLDER STEPS
 """
 
 import pathlib
@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr import EqRQRDQN
+import sb3_eqr
 from tests.toys import ChainEnv
 
 
@@ -45,14 +45,14 @@ def make_env(normalize: pathlib.Path | bool) -> VecEnv:
     return VecNormalize.load(str(normalize), env) if normalize else env
 
 
-def main(folder: pathlib.Path, steps: int) -> None:
+def main(algorithm: str, folder: pathlib.Path, steps: int) -> None:
     th.set_num_threads(1)
     normalize = folder / "normalize.pkl"
     env = make_env(normalize if normalize.exists() else False)
     env.unwrapped.reset()  # Monitor wants it; the states are set below
     if isinstance(env, VecNormalize):
         env.returns = pickle.loads((folder / "returns.pkl").read_bytes())
-    model = EqRQRDQN.load(folder / "model", env=env, device="cpu", force_reset=False)
+    model = getattr(sb3_eqr, algorithm).load(folder / "model", env=env, device="cpu", force_reset=False)
     model.load_replay_buffer(folder / "buffer")
     for index, state in enumerate(pickle.loads((folder / "env.pkl").read_bytes())):
         env.env_method("set_state", state, indices=index)
@@ -61,4 +61,4 @@ def main(folder: pathlib.Path, steps: int) -> None:
 
 
 if __name__ == "__main__":
-    main(pathlib.Path(sys.argv[1]), int(sys.argv[2]))
+    main(sys.argv[1], pathlib.Path(sys.argv[2]), int(sys.argv[3]))

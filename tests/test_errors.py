@@ -1,5 +1,8 @@
 """Wrong input is refused before the first step; what goes wrong later loses nothing."""
 
+import warnings
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -9,8 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_eqr import EqRQRDQN
-from tests.test_run import SMALL, make
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from tests.models import SMALL
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 
 
@@ -33,13 +36,12 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"aet_coef": None}, "aet_coef: expected a finite number"),
         ({"tau": None}, "tau: expected a finite number"),
         ({"priority_alpha": float("nan")}, "alpha"),
-        ({"policy_kwargs": {"n_quantiles": 0}}, "n_quantiles: expected a whole number of at least 1"),
         ({"policy_kwargs": {"latent_hidden_dim": 0}}, "latent_hidden_dim: expected a whole number of at least 1"),
         ({"policy_kwargs": {"group": 2}}, "expected GL\\(n\\), SE\\(n\\).*found 2"),
         ({"policy_kwargs": {"group": None}}, "Pass get_coef=0"),
         ({"replay_buffer_class": "x"}, "expected SequenceReplayBuffer"),
-        ({"replay_buffer_kwargs": {"n_steps": 1}}, "Pass n_steps=1 to EqRQRDQN"),
-        ({"replay_buffer_kwargs": {"alpha": 0.7}}, "Pass priority_alpha=0.7 to EqRQRDQN"),
+        ({"replay_buffer_kwargs": {"n_steps": 1}}, "Pass n_steps=1 to EqR"),
+        ({"replay_buffer_kwargs": {"alpha": 0.7}}, "Pass priority_alpha=0.7 to EqR"),
         ({"tau": 1.5}, "tau: expected a finite number in \\[0, 1\\], found 1.5"),
         ({"aet_coef": -1.0}, "aet_coef: expected a finite number of at least 0"),
         ({"reward_coef": float("nan")}, "reward_coef"),
@@ -51,26 +53,40 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"priority_beta": 1.4}, "beta"),
         ({"batch_size": 1}, "at least 2 samples"),
         ({"replay_buffer_class": ReplayBuffer}, "expected SequenceReplayBuffer"),
-        ({"policy": QRDQNPolicy}, "expected a policy derived from EqRQRDQNPolicy"),
+        ({"policy": QRDQNPolicy}, "expected a policy derived from EqR(QRDQN|Rainbow)Policy"),
         ({"policy": "MultiInputPolicy"}, "expected a Dict observation space"),
         ({"target_update_interval": 0}, "target_update_interval"),
         ({"policy_kwargs": {"sigma_init": -1.0}}, "sigma_init"),
         ({"policy": "LstmPolicy"}, "LstmPolicy unknown"),
         ({"train_freq": (1, "hour")}, "'step' or 'episode'"),
+        ({"priority_final_beta": 1.5}, "priority_final_beta: expected a finite number in \\[0, 1\\], found 1.5"),
+        ({"initial_n_steps": 0}, "initial_n_steps: expected a whole number of at least 1"),
+        ({"initial_n_steps": 497, "buffer_size": 499}, "prediction_depth \\+ 1 = 500 transitions per environment, found 499"),
+        ({"initial_gamma": -0.1}, "initial_gamma: expected a finite number in"),
+        ({"initial_gamma": 0.9, "gamma": 1.0}, "initial_gamma: expected it and gamma below 1"),
+        ({"annealing_steps": 0}, "annealing_steps"),
+        ({"reset_interval": 0}, "reset_interval: expected a whole number of at least 1"),
+        ({"reset_shrink_factor": 1.5}, "reset_shrink_factor"),
+        ({"reset_fraction": -1}, "reset_fraction"),
+        (
+            {"policy_kwargs": {"optimizer_class": "AdamV"}},
+            "optimizer_class: expected a class or a name in torch.optim.*'AdamV'",
+        ),
+        ({"policy_kwargs": {"features_extractor_class": "resnet"}}, "expected a class or one of \\['nature', 'impala'\\]"),
     ],
     ids=str,
 )
-def test_arguments_out_of_range(kwargs, message):
+def test_arguments_out_of_range(make, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make(ChainEnv(), **kwargs)
 
 
-def test_a_buffer_is_counted_per_environment():
+def test_a_buffer_is_counted_per_environment(make):
     with pytest.raises(ValueError, match="buffer_size=24"):
         make(make_vec_env(ChainEnv, 4), buffer_size=23)
 
 
-def test_a_frame_stack_that_is_not_one():
+def test_a_frame_stack_that_is_not_one(make):
     with pytest.raises(ValueError, match="expected a divisor"):
         make(ImageEnv((3, 36, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 2})
     model = make(ImageEnv((4, 40, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 4})
@@ -82,7 +98,7 @@ def test_a_frame_stack_that_is_not_one():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("where, what", [("obs", "observation"), ("reward", "reward"), ("terminal", "observation")])
-def test_bad_values_from_the_environment(where, what, value, normalize):
+def test_bad_values_from_the_environment(make, where, what, value, normalize):
     env = make_vec_env(lambda: PoisonEnv(where, value, at=60))
     model = make(VecNormalize(env) if normalize else env)
     if (where, value, normalize) == ("terminal", np.inf, True):
@@ -99,7 +115,7 @@ def test_bad_values_from_the_environment(where, what, value, normalize):
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-def test_a_bad_first_observation_is_refused_before_the_first_step():
+def test_a_bad_first_observation_is_refused_before_the_first_step(make):
     model = make(PoisonEnv("reset"))
     with pytest.raises(ValueError, match="step 0: expected finite observations"):
         model.learn(10)
@@ -107,7 +123,7 @@ def test_a_bad_first_observation_is_refused_before_the_first_step():
 
 
 @pytest.mark.parametrize("trained", [0, 5])
-def test_losses_that_are_not_finite_leave_the_last_good_model(trained, tmp_path):
+def test_losses_that_are_not_finite_leave_the_last_good_model(make, trained, tmp_path):
     """The first loss of a round tells on the round before: the model goes back to where that one began."""
     model = make(ChainEnv()).learn(40 + trained)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
@@ -127,10 +143,10 @@ def test_losses_that_are_not_finite_leave_the_last_good_model(trained, tmp_path)
     assert all(th.isfinite(value).all() for value in states)
     assert list(tmp_path.iterdir()) == []
     model.save(tmp_path / "model")  # what was kept can be saved
-    assert EqRQRDQN.load(tmp_path / "model").num_timesteps == model.num_timesteps
+    assert make.algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
 
 
-def test_the_very_first_update_may_be_the_bad_one():
+def test_the_very_first_update_may_be_the_bad_one(make):
     model = make(ChainEnv(), learning_starts=1000).learn(60)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
     model.replay_buffer.rewards[:] = 1e38
@@ -146,7 +162,7 @@ def test_the_very_first_update_may_be_the_bad_one():
 
 @pytest.mark.parametrize("gradient_steps", [1, 2, 3])
 @pytest.mark.parametrize("good_rounds", [0, 1, 4])
-def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(gradient_steps, good_rounds):
+def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, gradient_steps, good_rounds):
     """The losses of an update do not show what its own step has done: the next round's do."""
     model = make(ChainEnv(), gradient_steps=gradient_steps, learning_starts=40)
     sizes = []
@@ -169,7 +185,7 @@ def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(gradient_s
     model.learn(50, reset_num_timesteps=False)
 
 
-def test_moving_n_beyond_the_buffer_is_refused():
+def test_moving_n_beyond_the_buffer_is_refused(make):
     model = make(ChainEnv(), buffer_size=50).learn(60)
     model.n_steps = 60
     with pytest.raises(ValueError, match="n_steps \\+ prediction_depth \\+ 1 = 63"):
@@ -177,7 +193,7 @@ def test_moving_n_beyond_the_buffer_is_refused():
 
 
 @pytest.mark.parametrize("stacked", [False, True])
-def test_vec_normalize_inside_a_wrapper_that_changes_observations(stacked):
+def test_vec_normalize_inside_a_wrapper_that_changes_observations(make, stacked):
     env = make_vec_env(ImageEnv)
     wrong = VecNormalize(VecFrameStack(env, 2) if stacked else env, norm_obs=False)
     with pytest.raises(ValueError, match="Use VecNormalize\\(VecTransposeImage\\(env\\)\\)"):
@@ -186,10 +202,45 @@ def test_vec_normalize_inside_a_wrapper_that_changes_observations(stacked):
     assert make(right, "CnnPolicy").learn(60)._n_updates > 0
 
 
-def test_greedy_exploration_is_warned_of():
+def test_greedy_exploration_is_warned_of(make):
     with pytest.warns(UserWarning, match="exploration_final_eps"):
         make(ChainEnv(), policy_kwargs={"noisy": False})
 
 
 def test_small_settings_are_what_these_tests_think():
     assert SMALL["n_steps"] + SMALL["prediction_depth"] + 1 == 6
+
+
+@pytest.mark.parametrize("algorithm, name", [(EqRQRDQN, "n_quantiles"), (EqRRainbow, "n_atoms")])
+def test_numbers_of_atoms(algorithm, name):
+    with pytest.raises(ValueError, match=f"{name}: expected a whole number of at least [12], found 0"):
+        algorithm("MlpPolicy", ChainEnv(), policy_kwargs={name: 0})
+
+
+@pytest.mark.parametrize(
+    "support, message",
+    [
+        ({"v_min": 10.0}, "v_min: expected a number below v_max = 10.0, found 10.0"),
+        ({"v_min": 3, "v_max": 1}, "v_min: expected a number below v_max = 1, found 3"),
+        ({"v_max": float("inf")}, "v_max: expected a finite number"),
+        ({"v_min": "low"}, "v_min: expected a finite number"),
+        ({"n_atoms": 1}, "n_atoms: expected a whole number of at least 2"),
+    ],
+    ids=str,
+)
+def test_supports_that_are_none(support, message):
+    with pytest.raises(ValueError, match=message):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=support)
+
+
+def test_returns_that_the_support_cannot_hold_are_warned_of_once():
+    """CartPole pays 1 a step: 10 of them, discounted by 0.99, are 9.56, and 11 are 10.47."""
+    kwargs = {"learning_starts": 1_000, "seed": 0}
+    with pytest.warns(UserWarning, match=r"step 11: an episode's discounted return is 10.47, .*= \[-10.0, 10.0\]") as caught:
+        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs).learn(60)
+    assert sum("discounted return" in str(warning.message) for warning in caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(60)
+        scaled = VecNormalize(make_vec_env(lambda: gym.make("CartPole-v1"), 2), norm_reward=True)
+        EqRRainbow("MlpPolicy", scaled, **{**kwargs, "learning_starts": 100}).learn(400)

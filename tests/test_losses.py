@@ -1,10 +1,18 @@
 import math
 
 import numpy as np
+import pytest
 import torch as th
 from sb3_contrib.common.utils import quantile_huber_loss as contrib_quantile_huber_loss
 
-from sb3_eqr.common.losses import normalized_distance, quantile_huber_loss, reward_cross_entropy, reward_mse
+from sb3_eqr.common.losses import (
+    categorical_loss,
+    categorical_projection,
+    normalized_distance,
+    quantile_huber_loss,
+    reward_cross_entropy,
+    reward_mse,
+)
 
 
 def test_normalized_distance_by_hand():
@@ -43,6 +51,60 @@ def test_quantile_huber_loss_has_contribs_mean_and_gradient():
     loss.backward()
     assert th.equal(ours.grad, theirs.grad)
     th.testing.assert_close(quantile_huber_loss(values, target).mean(), loss.detach())
+
+
+@pytest.mark.parametrize(
+    "values, probabilities, expected",
+    [
+        ([-1.0, 0.0, 1.0], [0.2, 0.5, 0.3], [0.2, 0.5, 0.3]),  # the atoms themselves
+        ([-0.5, 0.0, 0.25], [0.2, 0.4, 0.4], [0.1, 0.1 + 0.4 + 0.3, 0.1]),  # between atoms
+        ([0.4, 0.4, 0.4], [0.2, 0.4, 0.4], [0.0, 0.6, 0.4]),  # terminal: all atoms on the reward
+        ([5.0, 6.0, 7.0], [0.2, 0.4, 0.4], [0.0, 0.0, 1.0]),  # all beyond the top
+        ([-3.0, -0.75, 9.0], [0.5, 0.2, 0.3], [0.5 + 0.15, 0.05, 0.3]),  # both ends clipped: no longer evenly spaced
+        ([0.5, -2.0, 0.0], [0.4, 0.1, 0.5], [0.1, 0.2 + 0.5, 0.2]),  # falling, then rising once clipped
+        ([2.0, 0.0, -1.5], [0.1, 0.2, 0.7], [0.7, 0.2, 0.1]),  # backwards
+    ],
+)
+def test_projection_by_hand(values, probabilities, expected):
+    found = categorical_projection(th.tensor([values]), th.tensor([probabilities]), -1.0, 1.0)
+    th.testing.assert_close(found, th.tensor([expected]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("n_atoms, v_min, v_max", [(51, -10.0, 10.0), (2, 0.0, 1.0), (11, -3.0, 17.0), (101, -0.1, 0.2)])
+def test_projection_against_a_loop_in_float64(n_atoms, v_min, v_max):
+    """For each atom and each value, the share of Bellemare et al. 2017, Eq. 7; terminal transitions among them."""
+    rng = np.random.default_rng(0)
+    batch, spacing = 64, (v_max - v_min) / (n_atoms - 1)
+    support = v_min + spacing * np.arange(n_atoms)
+    rewards = rng.normal(size=(batch, 1)) * (v_max - v_min) / 2
+    discounts = 0.99**10 * (rng.random((batch, 1)) < 0.7)  # 0: terminal
+    values = rewards + discounts * support
+    probabilities = rng.dirichlet(np.full(n_atoms, 0.3), size=batch)
+    expected = np.zeros((batch, n_atoms))
+    for b in range(batch):
+        for i in range(n_atoms):
+            for j in range(n_atoms):
+                distance = abs(min(max(values[b, j], v_min), v_max) - support[i]) / spacing
+                expected[b, i] += max(1 - distance, 0) * probabilities[b, j]
+    exact = categorical_projection(th.tensor(values), th.tensor(probabilities), v_min, v_max)
+    np.testing.assert_allclose(exact, expected, atol=1e-12)
+    single = categorical_projection(th.tensor(values).float(), th.tensor(probabilities).float(), v_min, v_max)
+    np.testing.assert_allclose(single, expected, atol=2e-5)
+    assert (single.double().sum(dim=1) - th.tensor(probabilities).float().double().sum(dim=1)).abs().max() < 1e-6
+    assert (single >= 0).all()
+
+
+def test_categorical_loss_by_hand():
+    logits = th.tensor([[0.0, 0.0], [0.0, math.log(3)], [5.0, 5.0]], requires_grad=True)
+    target = th.tensor([[0.5, 0.5], [0.5, 0.5], [1.0, 0.0]])
+    loss, divergence = categorical_loss(logits, target)
+    # -1/2 ln 1/4 - 1/2 ln 3/4 = ln 4 - 1/2 ln 3; the target's own entropy is ln 2, ln 2, 0
+    expected = [math.log(2), math.log(4) - math.log(3) / 2, math.log(2)]
+    th.testing.assert_close(loss, th.tensor(expected))
+    th.testing.assert_close(divergence, th.tensor([0.0, math.log(2) - math.log(3) / 2, math.log(2)]), rtol=1e-5, atol=1e-7)
+    assert not divergence.requires_grad and (divergence >= 0).all()
+    loss.sum().backward()
+    th.testing.assert_close(logits.grad, logits.detach().softmax(dim=1) - target)
 
 
 def test_reward_losses_by_hand():

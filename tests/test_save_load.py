@@ -14,10 +14,8 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
-from sb3_eqr import EqRQRDQN, MatrixLieGroup, SequenceReplayBuffer
-from sb3_eqr.eqr_qrdqn.policies import EqRQRDQNPolicy, EqRQuantileNetwork
+from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
 from tests.resume import Save, make_env
-from tests.test_run import make
 from tests.toys import ChainEnv, ImageEnv
 
 POLICIES = pytest.mark.parametrize(
@@ -31,12 +29,12 @@ def equal_states(a, b):
 
 @POLICIES
 @pytest.mark.parametrize("switches", [{}, {"policy_kwargs": {"noisy": False, "dueling": False}, "prediction_depth": 0}])
-def test_save_and_load(policy, env, switches, tmp_path):
+def test_save_and_load(make, policy, env, switches, tmp_path):
     model = make(env(), policy, **switches).learn(60)
     observations = np.concatenate([model.get_env().reset()]) if policy != "MultiInputPolicy" else model.get_env().reset()
     actions, _ = model.predict(observations, deterministic=True)
     model.save(tmp_path / "model.zip")
-    loaded = EqRQRDQN.load(tmp_path / "model.zip", env=env())
+    loaded = make.algorithm.load(tmp_path / "model.zip", env=env())
     assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
     assert np.array_equal(loaded.predict(observations, deterministic=True)[0], actions)
     a, b = model.policy.optimizer.state_dict(), loaded.policy.optimizer.state_dict()
@@ -44,87 +42,87 @@ def test_save_and_load(policy, env, switches, tmp_path):
     for key, state in a["state"].items():
         assert equal_states(state, b["state"][key])
     loaded.learn(60)  # and on
-    assert EqRQRDQN.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
+    assert make.algorithm.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
 
 
-def test_save_and_load_by_file_object():
+def test_save_and_load_by_file_object(make):
     model = make(ChainEnv()).learn(60)
     file = io.BytesIO()
     model.save(file)
     model.save_replay_buffer(buffer := io.BytesIO())
     file.seek(0)
     buffer.seek(0)
-    loaded = EqRQRDQN.load(file, env=ChainEnv())
+    loaded = make.algorithm.load(file, env=ChainEnv())
     assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
     loaded.load_replay_buffer(buffer)
     assert loaded.replay_buffer.size() == 60
 
 
-def test_checkpoints_made_in_the_middle_of_a_step_go_on(tmp_path):
+def test_checkpoints_made_in_the_middle_of_a_step_go_on(make, tmp_path):
     make(ChainEnv()).learn(120, callback=CheckpointCallback(50, str(tmp_path), save_replay_buffer=True))
-    model = EqRQRDQN.load(tmp_path / "rl_model_100_steps", env=ChainEnv())
+    model = make.algorithm.load(tmp_path / "rl_model_100_steps", env=ChainEnv())
     model.load_replay_buffer(tmp_path / "rl_model_replay_buffer_100_steps")
     model.learn(50, reset_num_timesteps=False)
     assert model.num_timesteps == 150 and model.replay_buffer.size() == 99 + 50
     assert model.replay_buffer.timeouts[98, 0] or model.replay_buffer.dones[98, 0]  # the episode was cut there
 
 
-def test_attributes_can_be_left_out_and_put_in(tmp_path):
+def test_attributes_can_be_left_out_and_put_in(make, tmp_path):
     model = make(ChainEnv())
     model.save(tmp_path / "a", exclude=["learning_rate"])
     model.custom = 3
     model.save(tmp_path / "b", exclude=["custom"])
-    assert not hasattr(EqRQRDQN.load(tmp_path / "b"), "custom")
+    assert not hasattr(make.algorithm.load(tmp_path / "b"), "custom")
     model.save(tmp_path / "c")
-    assert EqRQRDQN.load(tmp_path / "c").custom == 3
+    assert make.algorithm.load(tmp_path / "c").custom == 3
 
 
-def test_switches_can_be_changed_on_loading(tmp_path):
+def test_switches_can_be_changed_on_loading(make, tmp_path):
     make(ChainEnv()).save(tmp_path / "model")
-    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
+    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
     loaded.learn(60)
     assert loaded.replay_buffer.n_steps == 5
     for change in ({"get_coef": 0.0}, {"reward_coef": 0.0}, {"prediction_depth": 0}, {"aet_coef": 0.0, "double_q": False}):
-        EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
+        make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
     make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
-    richer = EqRQRDQN.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)
+    richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)
     assert richer._compute_losses(richer.replay_buffer.sample(8))[1].aet.shape == (8,)
 
 
-def test_another_seed_may_be_given_on_loading(tmp_path):
+def test_another_seed_may_be_given_on_loading(make, tmp_path):
     make(ChainEnv(), seed=0).learn(50).save(tmp_path / "model")
     draws = []
     for kwargs in ({}, {}, {"seed": 1}, {"seed": 2}):
-        EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), **kwargs)
+        make.algorithm.load(tmp_path / "model", env=ChainEnv(), **kwargs)
         draws.append((np.random.random(), th.rand(1).item()))
     assert draws[0] == draws[1] and len(set(draws)) == 3
 
 
-def test_a_target_that_is_no_copy_is_not_taken_for_one(tmp_path):
+def test_a_target_that_is_no_copy_is_not_taken_for_one(make, tmp_path):
     model = make(ChainEnv(), tau=0.005).learn(60)
     assert not model._target_is_online
     model.save(tmp_path / "model")
-    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv(), tau=1.0)
+    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), tau=1.0)
     assert not loaded._target_is_online
     loaded.learn(60)
     assert loaded._target_is_online
 
 
-def test_set_env_and_other_numbers_of_environments(tmp_path):
+def test_set_env_and_other_numbers_of_environments(make, tmp_path):
     model = make(make_vec_env(ChainEnv, 2)).learn(60)
     model.set_env(make_vec_env(ChainEnv, 2))
     model.learn(60, reset_num_timesteps=False)
     model.save(tmp_path / "model")
-    loaded = EqRQRDQN.load(tmp_path / "model", env=make_vec_env(ChainEnv, 3))
+    loaded = make.algorithm.load(tmp_path / "model", env=make_vec_env(ChainEnv, 3))
     loaded.learn(60)
     with pytest.raises(AssertionError, match="number of environments"):
         loaded.set_env(make_vec_env(ChainEnv, 2))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
-        EqRQRDQN.load(tmp_path / "model", env=ImageEnv())
+        make.algorithm.load(tmp_path / "model", env=ImageEnv())
 
 
-def test_set_parameters(tmp_path):
+def test_set_parameters(make, tmp_path):
     model, other = make(ChainEnv()).learn(60), make(ChainEnv(), seed=1)
     assert not equal_states(model.policy.state_dict(), other.policy.state_dict())
     other.set_parameters(model.get_parameters())
@@ -151,29 +149,29 @@ def test_set_parameters(tmp_path):
 
 
 @POLICIES
-def test_policies_alone(policy, env, tmp_path):
+def test_policies_alone(make, policy, env, tmp_path):
     model = make(env(), policy).learn(60)
     obs = model.get_env().reset()
     expected = model.predict(obs, deterministic=True)[0]
     model.policy.save(str(tmp_path / "policy"))
     loaded = type(model.policy).load(str(tmp_path / "policy"))
-    assert isinstance(loaded, EqRQRDQNPolicy)
+    assert type(loaded) is type(model.policy)
     assert equal_states(model.policy.state_dict(), loaded.state_dict())
     assert np.array_equal(loaded.predict(obs, deterministic=True)[0], expected)
-    model.quantile_net.save(str(tmp_path / "net"))
-    net = EqRQuantileNetwork.load(str(tmp_path / "net"))
+    model.policy.online.save(str(tmp_path / "net"))
+    net = type(model.policy.online).load(str(tmp_path / "net"))
     assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
 
 
-def test_a_group_of_ones_own_is_saved(tmp_path):
+def test_a_group_of_ones_own_is_saved(make, tmp_path):
     group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
     model = make(ChainEnv(), policy_kwargs={"group": group}).learn(60)
     model.save(tmp_path / "model")
-    loaded = EqRQRDQN.load(tmp_path / "model", env=ChainEnv()).learn(60)
+    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv()).learn(60)
     assert str(loaded.policy.latent_model.group) == str(group)
 
 
-def test_replay_buffer_goes_with_the_model(tmp_path):
+def test_replay_buffer_goes_with_the_model(make, tmp_path):
     model = make(ChainEnv()).learn(60)
     model.save_replay_buffer(tmp_path / "buffer")
     old = model.replay_buffer
@@ -183,16 +181,28 @@ def test_replay_buffer_goes_with_the_model(tmp_path):
     model.learn(60, reset_num_timesteps=False)
 
 
-@pytest.mark.parametrize("normalize", [False, True])
-def test_a_run_that_was_stopped_is_the_run_that_was_not(normalize, tmp_path):
+KNOBS = {  # two resets after the file is written, one before; n and γ on their way
+    "reset_interval": 50,
+    "initial_n_steps": 6,
+    "initial_gamma": 0.9,
+    "annealing_steps": 70,
+    "tau": 0.05,
+    "policy_kwargs": {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}},
+}
+
+
+@pytest.mark.parametrize("normalize, knobs", [(False, {}), (True, {}), (False, KNOBS)])
+def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, tmp_path):
     """Saved after 120 of 240 steps, loaded in a new process, continued: the same parameters to the last bit."""
-    model = make(make_env(normalize), buffer_size=200, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p)
+    model = make(make_env(normalize), buffer_size=200, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
     model.learn(240, callback=Save(tmp_path, at=120))
-    command = [sys.executable, "-m", "tests.resume", str(tmp_path), "120"]
+    command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "120"]
     subprocess.run(command, check=True, timeout=120)
-    continued = EqRQRDQN.load(tmp_path / "continued", device="cpu")
-    halfway = EqRQRDQN.load(tmp_path / "model", device="cpu")
+    continued = make.algorithm.load(tmp_path / "continued", device="cpu")
+    halfway = make.algorithm.load(tmp_path / "model", device="cpu")
     assert continued.num_timesteps == 240 and continued._n_updates == model._n_updates
+    assert continued._resets == model._resets == ([50, 100, 150] if knobs else [])
+    assert halfway._resets == model._resets[:1]
     assert equal_states(model.policy.state_dict(), continued.policy.state_dict())
     assert not equal_states(model.policy.state_dict(), halfway.policy.state_dict())
     a, b = model.policy.optimizer.state_dict()["state"], continued.policy.optimizer.state_dict()["state"]
@@ -202,14 +212,32 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(normalize, tmp_path):
 # ---------------------------------------------------------------------------------------------- wrong files
 
 
-def test_a_file_of_another_class(tmp_path):
+def test_a_file_of_another_class(make, tmp_path):
     for algorithm in (QRDQN, DQN):
         algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
-        with pytest.raises(ValueError, match=r"expected a policy derived from EqRQRDQNPolicy, found .*QNPolicy"):
-            EqRQRDQN.load(tmp_path / "stock", env=ChainEnv())
+        with pytest.raises(ValueError, match=r"expected a policy derived from EqR(QRDQN|Rainbow)Policy, found .*QNPolicy"):
+            make.algorithm.load(tmp_path / "stock", env=ChainEnv())
 
 
-def test_parameters_of_another_group(tmp_path):
+def test_the_agents_do_not_take_each_others_files(tmp_path):
+    EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "quantiles")
+    with pytest.raises(ValueError, match=r"expected a policy derived from EqRRainbowPolicy, found .*EqRQRDQNPolicy"):
+        EqRRainbow.load(tmp_path / "quantiles")
+
+
+def test_parameters_for_another_support(tmp_path):
+    kwargs = {"buffer_size": 100, "device": "cpu"}
+    model = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs)
+    model.save(tmp_path / "model")
+    other = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs, policy_kwargs={"v_max": 100.0})
+    with pytest.raises(ValueError, match=r"expected parameters for .*\[-10.0, 100.0\], found parameters for \[-10.0, 10.0\]"):
+        other.set_parameters(str(tmp_path / "model"))
+    other.save(tmp_path / "other")
+    loaded = EqRRainbow.load(tmp_path / "other")
+    assert (loaded.policy.v_min, loaded.policy.v_max) == (-10, 100) and loaded.q_net.support[-1] == 100
+
+
+def test_parameters_of_another_group(make, tmp_path):
     """SE(2) with 4 blocks and GL(2) with 3 have algebras of the same size."""
     model = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4}, prediction_depth=0)
     other = make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": 18}, prediction_depth=0)
@@ -221,11 +249,11 @@ def test_parameters_of_another_group(tmp_path):
             wrong.set_parameters(str(tmp_path / "model"))
         assert equal_states(before, wrong.policy.state_dict())
     with pytest.raises(ValueError, match="policy kwargs"):
-        EqRQRDQN.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
+        make.algorithm.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_checkpoints_cut_off_halfway(share, tmp_path):
+def test_checkpoints_cut_off_halfway(make, share, tmp_path):
     model = make(ChainEnv()).learn(60)
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
@@ -233,14 +261,14 @@ def test_checkpoints_cut_off_halfway(share, tmp_path):
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: int(len(content) * share)])
     with pytest.raises(ValueError, match="cut off"):
-        EqRQRDQN.load(tmp_path / "model")
+        make.algorithm.load(tmp_path / "model")
     buffer = model.replay_buffer
     with pytest.raises(ValueError, match="cut off"):
         model.load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer is buffer
 
 
-def test_replay_buffers_of_others(tmp_path):
+def test_replay_buffers_of_others(make, tmp_path):
     model = make(ChainEnv()).learn(60)
     stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
     stock.save_replay_buffer(tmp_path / "stock")
@@ -256,7 +284,7 @@ def test_replay_buffers_of_others(tmp_path):
             model.load_replay_buffer(tmp_path / "other")
 
 
-def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_save_that_fails_leaves_the_old_file(make, tmp_path, monkeypatch):
     model = make(ChainEnv())
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch as th
 
-from tests.test_run import make
+from tests.models import MAKERS
 from tests.toys import ChainEnv, ImageEnv
 
 
-def trained_model(**kwargs):
+def trained_model(make, **kwargs):
     policy_kwargs = {"noisy": False, **kwargs.pop("policy_kwargs", {})}
     settings = {"tau": 0.1, "exploration_final_eps": 0.1, **kwargs}
     return make(ChainEnv(), policy_kwargs=policy_kwargs, **settings).learn(120)
@@ -16,15 +16,15 @@ def trained_model(**kwargs):
 
 @pytest.mark.parametrize("double_q", [True, False])
 @pytest.mark.parametrize("dueling", [True, False])
-def test_td_loss_by_loops(double_q, dueling):
-    model = trained_model(double_q=double_q, policy_kwargs={"dueling": dueling}, prediction_depth=0, gamma=0.9)
+def test_quantile_td_loss_by_loops(double_q, dueling):
+    model = trained_model(MAKERS[0], double_q=double_q, policy_kwargs={"dueling": dueling}, prediction_depth=0, gamma=0.9)
     model.policy.set_training_mode(False)
     samples = model.replay_buffer.sample(16)
     with th.no_grad():
         td, _ = model._compute_losses(samples)
-        now = model.quantile_net(samples.observations).double().numpy()  # (16, 9, 3)
-        online = model.quantile_net(samples.next_observations).double().numpy()
-        target = model.quantile_net_target(samples.next_observations).double().numpy()
+        now = model.policy.online(samples.observations).double().numpy()  # (16, 9, 3)
+        online = model.policy.online(samples.next_observations).double().numpy()
+        target = model.policy.target(samples.next_observations).double().numpy()
     assert not np.allclose(online, target)  # or the test could not tell double Q
     chosen = set()
     for b in range(16):
@@ -44,9 +44,45 @@ def test_td_loss_by_loops(double_q, dueling):
     assert th.equal(td.priorities, td.loss)
 
 
-def test_target_states_reach_the_latent_model_in_order(monkeypatch):
+@pytest.mark.parametrize("double_q", [True, False])
+@pytest.mark.parametrize("dueling", [True, False])
+def test_categorical_td_loss_by_loops(double_q, dueling):
+    """Each atom of the target's distribution is moved, clipped and shared out by hand, in float64."""
+    network = {"dueling": dueling, "v_min": -1.0, "v_max": 2.0}
+    model = trained_model(MAKERS[1], double_q=double_q, policy_kwargs=network, prediction_depth=0, gamma=0.9)
+    model.policy.set_training_mode(False)
+    with th.no_grad():  # a target that chooses other actions
+        for parameter in model.q_net_target.head.advantage[-1].parameters():
+            parameter.neg_()
+    samples = model.replay_buffer.sample(16)
+    with th.no_grad():
+        td, _ = model._compute_losses(samples)
+        now, online = (model.q_net.log_probs(o).double().numpy() for o in (samples.observations, samples.next_observations))
+        target = model.q_net_target.log_probs(samples.next_observations).double().numpy()  # (16, 9, 3)
+    support = [-1.0 + 3.0 * i / 8 for i in range(9)]
+    q_values = [np.einsum("bna,n->ba", np.exp(logs), support) for logs in (online, target)]
+    assert (q_values[0].argmax(axis=1) != q_values[1].argmax(axis=1)).any()
+    for b in range(16):
+        best = int(np.argmax(q_values[0 if double_q else 1][b]))
+        alive = 1 - samples.dones[b, 0].item()
+        goal = np.zeros(9)
+        for j in range(9):
+            value = samples.rewards[b, 0].item() + alive * samples.discounts[b, 0].item() * support[j]
+            place = (min(max(value, -1.0), 2.0) + 1.0) / 0.375
+            below = min(int(place), 7)
+            goal[below] += np.exp(target[b, j, best]) * (below + 1 - place)
+            goal[below + 1] += np.exp(target[b, j, best]) * (place - below)
+        current = now[b, :, samples.actions[b, 0].item()]
+        cross_entropy = -sum(goal * current)
+        divergence = sum(g * (np.log(g) - c) for g, c in zip(goal, current, strict=True) if g > 0)
+        assert td.loss[b].item() == pytest.approx(cross_entropy, rel=1e-5)
+        assert td.priorities[b].item() == pytest.approx(max(divergence, 0), rel=1e-4, abs=2e-6)
+        assert td.q_values[b].item() == pytest.approx(np.exp(current) @ support, rel=1e-5, abs=1e-6)
+
+
+def test_target_states_reach_the_latent_model_in_order(make, monkeypatch):
     """The online and target encodings of s_t, s_{t+1} ... s_{t+M}, each in its place."""
-    model = trained_model()
+    model = trained_model(make)
     samples = model.replay_buffer.sample(8)
     seen = {}
     forward = type(model.policy.latent_model).forward
@@ -55,18 +91,18 @@ def test_target_states_reach_the_latent_model_in_order(monkeypatch):
     )
     model._compute_losses(samples)
     state, actions, rewards, mask, target_states = seen["args"][:5]
-    th.testing.assert_close(state, model.quantile_net.features(samples.observations))
+    th.testing.assert_close(state, model.policy.online.features(samples.observations))
     assert actions is samples.rollout_actions and rewards is samples.rollout_rewards and mask is samples.mask
     assert target_states.shape[1] == 3 and not target_states.requires_grad
-    target = model.quantile_net_target
+    target = model.policy.target
     th.testing.assert_close(target_states[:, 0], target.features(samples.observations).detach())
     for m in range(2):
         expected = target.features(samples.rollout_observations[:, m]).detach()
         th.testing.assert_close(target_states[:, m + 1], expected)
 
 
-def test_replay_weights_multiply_every_loss():
-    model = trained_model(max_grad_norm=None, learning_rate=1e-3)
+def test_replay_weights_multiply_every_loss(make):
+    model = trained_model(make, max_grad_norm=None, learning_rate=1e-3)
     samples = model.replay_buffer.sample(8)
     model.policy.set_training_mode(True)
 
@@ -87,8 +123,8 @@ def test_replay_weights_multiply_every_loss():
         assert (n == 0).all()
 
 
-def test_new_priorities_are_td_losses():
-    model = trained_model(priority_alpha=0.5)
+def test_new_priorities_are_those_of_the_td_loss(make):
+    model = trained_model(make, priority_alpha=0.5)
     samples = model.replay_buffer.sample(8)
     with th.no_grad():
         td, _ = model._compute_losses(samples)
@@ -96,32 +132,32 @@ def test_new_priorities_are_td_losses():
     found = model.replay_buffer._tree.get(samples.indices)
     last = {int(i): b for b, i in enumerate(samples.indices)}  # of a leaf drawn twice, the last counts
     for index, b in last.items():
-        expected = (td.loss[b].item() + 1e-6) ** 0.5
+        expected = (td.priorities[b].item() + 1e-6) ** 0.5
         assert found[list(samples.indices).index(index)] == pytest.approx(expected, rel=1e-5)
 
 
-def test_gradients_are_clipped_together():
-    model = trained_model(max_grad_norm=0.01)
+def test_gradients_are_clipped_together(make):
+    model = trained_model(make, max_grad_norm=0.01)
     model._update(model.replay_buffer.sample(8))
     norm = th.stack([p.grad.norm() for p in model._trained]).norm().item()
     assert norm == pytest.approx(0.01, rel=1e-3)
     trained = {id(p) for p in model._trained}
     latent = {id(p) for p in model.policy.latent_model.parameters()}
-    assert latent < trained and {id(p) for p in model.quantile_net.parameters()} < trained
+    assert latent < trained and {id(p) for p in model.policy.online.parameters()} < trained
 
 
-def test_one_features_pass_serves_both(monkeypatch):
+def test_one_features_pass_serves_both(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(60)
     calls = []
-    network = type(model.quantile_net)
+    network = type(model.policy.online)
     features = network.features
     monkeypatch.setattr(network, "features", lambda self, obs: calls.append((self, len(obs))) or features(self, obs))
     model.train(1, 8)
     # s_t with gradient, then everything that the target sees: s_{t+n} and M steps of rollout.
-    assert calls == [(model.quantile_net, 8), (model.quantile_net_target, 8 * (1 + 2))]
+    assert calls == [(model.policy.online, 8), (model.policy.target, 8 * (1 + 2))]
 
 
-def test_online_and_target_observations_are_augmented(monkeypatch):
+def test_online_and_target_observations_are_augmented(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(60)
     seen = []
     augment = model._augment.images
@@ -131,7 +167,7 @@ def test_online_and_target_observations_are_augmented(monkeypatch):
 
 
 @pytest.mark.parametrize("off", [{"shift_pixels": 0}, {"intensity_scale": 0.0}, {}])
-def test_augmentation_switches(off):
+def test_augmentation_switches(make, off):
     model = make(ImageEnv(), "CnnPolicy", **off)
     images = th.randint(1, 256, (16, 1, 36, 36), dtype=th.uint8)
     found = model._augment(images)

@@ -11,8 +11,9 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
 from sb3_eqr.common.augmentations import ImageAugmentation
-from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer
+from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.eqr_setup import EqRSetup
+from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
@@ -25,9 +26,6 @@ class TDLoss(NamedTuple):
     loss: th.Tensor  # (B,)
     priorities: th.Tensor  # (B,), ≥ 0, no gradient
     q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
-
-
-METRICS = ("td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value")
 
 
 class EqRAlgorithm(EqRSetup):
@@ -43,7 +41,7 @@ class EqRAlgorithm(EqRSetup):
         depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd)
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
         self._target_is_copy = True  # it is built as one
-        self._monitor = UpdateMonitor(METRICS, self.policy, self.policy.optimizer)
+        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
         obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
         obs_spaces = obs_spaces or {"": self.observation_space}
         float_images = not self.policy.normalize_images
@@ -72,19 +70,43 @@ class EqRAlgorithm(EqRSetup):
         buffer = self.replay_buffer
         assert buffer is not None
         self._collect_metrics()
-        # A schedule may have moved these since the last call.
-        buffer.n_steps, buffer.gamma, buffer.prediction_depth = self.n_steps, self.gamma, self.depth
-        if not buffer.can_sample():
-            return  # the first window is not complete yet
+        remaining = max(self._current_progress_remaining, 0.0)
         if isinstance(buffer, PrioritizedSequenceReplayBuffer):
-            buffer.beta = 1.0 - (1.0 - self.priority_beta) * max(self._current_progress_remaining, 0.0)
+            buffer.beta = self.priority_final_beta + (self.priority_beta - self.priority_final_beta) * remaining
             self.logger.record("train/beta", buffer.beta)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         self._monitor.start_round(self._n_updates)
         for _ in range(gradient_steps):
+            if self._reset_is_due():
+                self._reset()
+            self._set_window(buffer)
+            if not buffer.can_sample():
+                break  # the first window is not complete yet
             self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _set_window(self, buffer: SequenceReplayBuffer) -> None:
+        """n, γ and M as they are now: a schedule or a callback may have moved them."""
+        last_reset = self._resets[-1] if self._resets else 0
+        progress = min((self._n_updates - last_reset) / self.annealing_steps, 1.0)
+        buffer.n_steps = anneal_n_steps(self.initial_n_steps, self.n_steps, progress)
+        buffer.gamma = anneal_gamma(self.initial_gamma, self.gamma, progress)
+        buffer.prediction_depth = self.depth
+        for name in ("n_steps", "gamma"):
+            if getattr(self, f"initial_{name}") is not None:
+                self.logger.record(f"train/{name}", getattr(buffer, name))
+
+    def _reset_is_due(self) -> bool:
+        done = 1.0 - self._current_progress_remaining
+        interval = self.reset_interval
+        return interval is not None and self._n_updates > 0 and self._n_updates % interval == 0 and done < self.reset_fraction
+
+    def _reset(self) -> None:
+        self.policy.reset_parameters(self.reset_shrink_factor)
+        self._target_is_copy = True
+        self._resets.append(self._n_updates)
+        self.logger.record("train/n_resets", len(self._resets))
 
     def _update(self, samples: SequenceReplayBufferSamples) -> None:
         """One gradient step, the target, the priorities."""
@@ -108,8 +130,9 @@ class EqRAlgorithm(EqRSetup):
         if isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
             self.replay_buffer.update_priorities(samples.indices, td.priorities)
         with th.no_grad():
-            losses = (td.loss, *(loss.new_zeros(1) if part is None else part for part in auxiliary))
-            self._monitor.add([*(part.mean() for part in losses), loss.detach(), grad_norm, td.q_values.mean()])
+            parts = {"td_loss": td.loss, **{f"{name}_loss": part for name, part in auxiliary._asdict().items()}}
+            figures = {name: part.mean() for name, part in parts.items() if part is not None}
+            self._monitor.add({**figures, "loss": loss, "grad_norm": grad_norm, "mean_q_value": td.q_values.mean()})
 
     def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss, LatentLosses]:
         """
@@ -207,6 +230,7 @@ class EqRAlgorithm(EqRSetup):
                 self.logger.record_mean(f"train/{name}", value)
         except BadUpdateError as error:
             self._n_updates = error.n_updates
+            self._resets = [reset for reset in self._resets if reset < error.n_updates]  # later ones were put back, too
             self._target_is_copy = False
             raise
 

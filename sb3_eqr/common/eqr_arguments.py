@@ -58,8 +58,15 @@ class EqRArguments(SafeFiles):
         prioritized_replay: bool = True,
         priority_alpha: float = 0.5,
         priority_beta: float = 0.4,
+        priority_final_beta: float = 1.0,
         shift_pixels: int = 4,
         intensity_scale: float = 0.05,
+        initial_n_steps: int | None = None,
+        initial_gamma: float | None = None,
+        annealing_steps: int = 10_000,
+        reset_interval: int | None = None,
+        reset_shrink_factor: float = 0.5,
+        reset_fraction: float = 0.9,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -102,9 +109,21 @@ class EqRArguments(SafeFiles):
         :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
         :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
         :param priority_alpha: α, the priority exponent
-        :param priority_beta: β at the start of training; it is annealed to 1
+        :param priority_beta: β at the start of training
+        :param priority_final_beta: β at the end of training, reached linearly; with ``priority_beta=0.5`` and
+            ``priority_alpha=0.5``, 0.5 gives the weights 1/√P of BBF
         :param shift_pixels: random shift of images, in pixels; 0 switches it off
         :param intensity_scale: random intensity of images; 0 switches it off
+        :param initial_n_steps: n at the start of training and after each reset, from where it moves to ``n_steps``
+            geometrically; 10 in BBF (Schwarzer et al. 2023, https://arxiv.org/abs/2305.19452). ``None``: n does not move
+        :param initial_gamma: the same for γ, geometrically in 1 - γ; 0.97 in BBF. ``None``: γ does not move
+        :param annealing_steps: in how many gradient steps they get there; 10,000 in BBF
+        :param reset_interval: every so many gradient steps the Q head is drawn afresh, encoder and latent model are shrunk
+            and perturbed, and the optimiser forgets (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802, and SR-SPR,
+            D'Oro et al. 2023, https://openreview.net/forum?id=OpC-9aBBVJe); 40,000 in BBF. ``None``: never
+        :param reset_shrink_factor: α in [0, 1]: at a reset, encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF
+        :param reset_fraction: fraction of the entire training period after which there are no resets any more, so that
+            the final agent has had time to recover
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation
@@ -160,6 +179,14 @@ class EqRArguments(SafeFiles):
         self.priority_beta = priority_beta
         self.shift_pixels = shift_pixels
         self.intensity_scale = intensity_scale
+        self.priority_final_beta = priority_final_beta
+        self.initial_n_steps = initial_n_steps
+        self.initial_gamma = initial_gamma
+        self.annealing_steps = annealing_steps
+        self.reset_interval = reset_interval
+        self.reset_shrink_factor = reset_shrink_factor
+        self.reset_fraction = reset_fraction
+        self._resets: list[int] = []  # the number of updates before each reset so far
         if _init_setup_model:
             self._setup_model()
 
@@ -170,7 +197,20 @@ class EqRArguments(SafeFiles):
             check_number(name, getattr(self, name), 0, whole=True)
         for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
             check_number(name, getattr(self, name), 0)
-        check_number("tau", self.tau, 0, 1)
+        for name in ("tau", "priority_final_beta", "reset_shrink_factor", "reset_fraction"):
+            check_number(name, getattr(self, name), 0, 1)
+        check_number("annealing_steps", self.annealing_steps, 1, whole=True)
+        if self.reset_interval is not None:
+            check_number("reset_interval", self.reset_interval, 1, whole=True)
+        if self.initial_n_steps is not None:
+            check_number("initial_n_steps", self.initial_n_steps, 1, whole=True)
+        if self.initial_gamma is not None:
+            check_number("initial_gamma", self.initial_gamma, 0, 1)
+            if max(self.initial_gamma, self.gamma) == 1:
+                raise ValueError(
+                    f"initial_gamma: expected it and gamma below 1, since 1 - γ is annealed by a factor, found "
+                    f"{self.initial_gamma} and {self.gamma}. Pass initial_gamma=None for a constant γ."
+                )
         check_number("batch_size", self.batch_size, 1, whole=True)
         if self.depth > 0 and self.batch_size < 2:
             raise ValueError(

@@ -83,7 +83,7 @@ class EqRSetup(EqRArguments):
                 "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
                 'Pass policy_kwargs={"net_arch": [256]} or {"shared_projection": False}, or aet_coef=0.'
             )
-        if self.exploration_final_eps == 0 and not self.policy.noisy:
+        if self.exploration_final_eps == 0 and not self.policy.noisy and self.reset_interval is None:  # resets explore, too
             warnings.warn(
                 "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
                 "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
@@ -135,7 +135,8 @@ class EqRSetup(EqRArguments):
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
     def _make_replay_buffer(self, buffer_class: type[SequenceReplayBuffer]) -> SequenceReplayBuffer:
-        kwargs: dict[str, Any] = {"n_steps": self.n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
+        longest = max(self.n_steps, self.initial_n_steps or 0)  # the buffer must hold it; the loop sets n before it samples
+        kwargs: dict[str, Any] = {"n_steps": longest, "gamma": self.gamma, "prediction_depth": self.depth}
         if issubclass(buffer_class, PrioritizedSequenceReplayBuffer):
             kwargs.update(alpha=self.priority_alpha, beta=self.priority_beta)
         kwargs.update(self.replay_buffer_kwargs)

@@ -1,5 +1,6 @@
-"""Layers that PyTorch does not have: noisy linear layers, the paper's convolutions, the distributional head."""
+"""Layers that PyTorch does not have: noisy linear layers, the distributional head, convolutional trunks."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import sqrt
 
@@ -127,30 +128,90 @@ class DistributionalHead(nn.Module):
         return th.cat([stream[0](features) for stream in streams], dim=-1)
 
 
+NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and appendix B.4
+
+
 class ConvTrunk(nn.Sequential):
     """
-    The three convolutions of Mnih et al. 2015, flattened, without the linear layer (appendix B.4):
-    32 8×8 filters with stride 4, 64 4×4 with stride 2, 64 3×3 with stride 1, a ReLU after each.
+    Convolutions with a ReLU after each, flattened, without a linear layer.
 
     :param in_channels: C
+    :param layers: (filters, kernel size, stride) of each; the default is the network of Mnih et al. 2015 (appendix B.4)
     """
 
-    def __init__(self, in_channels: int):
-        super().__init__(
-            nn.Conv2d(in_channels, 32, kernel_size=8, stride=4),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(32, 64, kernel_size=4, stride=2),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(64, 64, kernel_size=3, stride=1),
-            nn.ReLU(inplace=True),
-            nn.Flatten(),
-        )
+    def __init__(self, in_channels: int, layers: Sequence[Sequence[int]] = NATURE_LAYERS):
+        modules: list[nn.Module] = []
+        for filters, kernel_size, stride in layers:
+            modules += [nn.Conv2d(in_channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
+            in_channels = filters
+        super().__init__(*modules, nn.Flatten())
+
+    @staticmethod
+    def smallest_image(layers: Sequence[Sequence[int]] = NATURE_LAYERS) -> int:
+        """
+        :return: the height and width that leave one pixel after the last layer
+        """
+        size = 1
+        for _, kernel_size, stride in reversed(layers):
+            size = (size - 1) * stride + kernel_size
+        return size
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """
-        :param images: (B, C, H, W), floating point, H and W at least 36
+        :param images: (B, C, H, W), floating point
         :return: (B, features)
         """
         # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU. Weights stay as they are,
         # since the orthogonal initialisation of stock PPO takes no other layout.
         return super().forward(images.contiguous(memory_format=th.channels_last))
+
+
+class ImpalaTrunk(ConvTrunk):
+    """
+    The residual network of IMPALA (Espeholt et al. 2018, Figure 3, https://arxiv.org/abs/1802.01561), flattened, without
+    a linear layer: three stages of a 3×3 convolution, a 3×3 max pooling with stride 2 and two residual blocks.
+
+    :param in_channels: C
+    :param width_scale: multiplies the 16, 32 and 32 channels of the stages; BBF uses 4
+    """
+
+    def __init__(self, in_channels: int, width_scale: float = 1):
+        modules: list[nn.Module] = []
+        for channels in (16, 32, 32):
+            width = max(round(channels * width_scale), 1)
+            modules += [nn.Conv2d(in_channels, width, 3, padding=1), nn.MaxPool2d(3, stride=2, padding=1)]
+            modules += [ResidualBlock(width), ResidualBlock(width)]
+            in_channels = width
+        nn.Sequential.__init__(self, *modules, nn.ReLU(), nn.Flatten())
+
+
+class ResidualBlock(nn.Module):
+    """
+    x + conv(ReLU(conv(ReLU(x)))), with 3×3 convolutions.
+
+    :param channels: of input and output
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: (B, C, H, W)
+        :return: the same shape
+        """
+        return images + self.conv2(F.relu(self.conv1(F.relu(images)), inplace=True))
+
+
+def rescaled(features: th.Tensor) -> th.Tensor:
+    """
+    Each sample's features shifted and scaled to [0, 1] (Schrittwieser et al. 2020, appendix G,
+    https://arxiv.org/abs/1911.08265; SPR and BBF do so with their convolutions' output).
+
+    :param features: (B, D)
+    :return: (B, D)
+    """
+    low = features.amin(dim=1, keepdim=True)
+    return (features - low) / (features.amax(dim=1, keepdim=True) - low + 1e-5)

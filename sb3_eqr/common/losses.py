@@ -34,6 +34,41 @@ def quantile_huber_loss(current: th.Tensor, target: th.Tensor) -> th.Tensor:
     return (asymmetry * huber).sum(dim=1).mean(dim=1)
 
 
+def categorical_projection(values: th.Tensor, probabilities: th.Tensor, v_min: float, v_max: float) -> th.Tensor:
+    """
+    A distribution on any values, projected onto as many evenly spaced atoms on [v_min, v_max]: each value is clipped to
+    that range and gives its probability to the two atoms beside it, the nearer one more
+    (Bellemare et al. 2017, Eq. 7, https://arxiv.org/abs/1707.06887). The mass is kept.
+
+    :param values: in any order, (B, N)
+    :param probabilities: of these values, (B, N)
+    :param v_min: the first atom
+    :param v_max: the last atom, > v_min
+    :return: probabilities of the atoms, (B, N)
+    """
+    n_atoms = values.shape[1]
+    # In units of atoms, so that the two shares of a value add up to 1 exactly.
+    positions = ((values - v_min) * ((n_atoms - 1) / (v_max - v_min))).clamp(0, n_atoms - 1)  # (B, N)
+    atoms = th.arange(n_atoms, device=values.device, dtype=values.dtype)  # (N,)
+    shares = (1 - (positions[:, :, None] - atoms).abs()).clamp(min=0)  # (B, N, N): of each value, to each atom
+    return (probabilities[:, None, :] @ shares).squeeze(1)
+
+
+def categorical_loss(logits: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Cross-entropy of a predicted distribution, and the KL divergence from it to the target: the same number less the
+    target's own entropy, so that a transition that is predicted as well as can be has priority 0
+    (the priority of Rainbow, https://arxiv.org/abs/1710.02298).
+
+    :param logits: of the atoms, (B, N)
+    :param target: probabilities of the atoms, without gradient, (B, N)
+    :return: cross-entropy, (B,), and KL(target ‖ prediction) ≥ 0 without gradient, (B,)
+    """
+    cross_entropy = -(target * logits.log_softmax(dim=1)).sum(dim=1)
+    entropy = -th.xlogy(target, target).sum(dim=1)
+    return cross_entropy, (cross_entropy.detach() - entropy).clamp(min=0)
+
+
 def reward_mse(prediction: th.Tensor, reward: th.Tensor) -> th.Tensor:
     """
     Squared error of the predicted reward (Eq. 17).

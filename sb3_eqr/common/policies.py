@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
 from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.features_extractor import DEFAULT_GROUP, ConvExtractor, GroupFeaturesExtractor
+from sb3_eqr.common.features_extractor import DEFAULT_GROUP, GroupFeaturesExtractor, ImageExtractor, find_trunk
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
 from sb3_eqr.common.layers import DistributionalHead
@@ -116,12 +116,14 @@ class EqRPolicy(BasePolicy):
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: hidden sizes of the Q head; ``None``: [256] (appendix B.4)
     :param activation_fn: Activation function of the Q head
-    :param features_extractor_class: the trunk; the group encoder is put behind it. ``None``: SB3's ``FlattenExtractor``
-        (MlpPolicy), the paper's three convolutions (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
+    :param features_extractor_class: the trunk; the group encoder is put behind it. Its class or its name: "nature" (the
+        paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``). ``None``: SB3's
+        ``FlattenExtractor`` (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: its keyword arguments
     :param normalize_images: Whether to divide images by 255 (True by default)
-    :param optimizer_class: The optimizer to use, Adam by default
-    :param optimizer_kwargs: its keyword arguments, excluding the learning rate
+    :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
+    :param optimizer_kwargs: its keyword arguments, excluding the learning rate. ``weight_decay`` reaches matrices only,
+        not biases and batch-norm parameters (as in BBF, https://arxiv.org/abs/2305.19452)
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
@@ -131,6 +133,8 @@ class EqRPolicy(BasePolicy):
     :param sigma_init: their initial noise σ₀
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
     :param shared_projection: whether the AET loss projects with the first layer of the Q head; else with a layer of its own
+    :param act_with_target: choose actions by the target network, which is steadier with ``tau`` < 1 (as SR-SPR,
+        https://openreview.net/forum?id=OpC-9aBBVJe, and BBF do); else by the online network
     :param reward_loss: set by the algorithm, see there
     :param stock_kwargs: what else the stock policy takes
     :raises ValueError: for an argument out of its range
@@ -151,10 +155,10 @@ class EqRPolicy(BasePolicy):
         lr_schedule: Schedule,
         net_arch: list[int] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
-        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_class: str | type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
-        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_class: str | type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         group: str | Group | None = DEFAULT_GROUP,
         n_blocks: int | None = None,
@@ -164,6 +168,7 @@ class EqRPolicy(BasePolicy):
         sigma_init: float = 0.5,
         latent_hidden_dim: int = 256,
         shared_projection: bool = True,
+        act_with_target: bool = False,
         reward_loss: str = "mse",
         **stock_kwargs: Any,
     ):
@@ -177,6 +182,7 @@ class EqRPolicy(BasePolicy):
         self.noisy = noisy
         self.sigma_init = sigma_init
         self.shared_projection = shared_projection
+        self.act_with_target = act_with_target
         self.reward_loss = reward_loss
         super().__init__(  # builds
             observation_space,
@@ -184,10 +190,10 @@ class EqRPolicy(BasePolicy):
             lr_schedule,  # type: ignore[arg-type]
             net_arch=list(DEFAULT_NET_ARCH) if net_arch is None else net_arch,
             activation_fn=activation_fn,
-            features_extractor_class=features_extractor_class or self.default_trunk_class,
+            features_extractor_class=find_trunk(features_extractor_class or self.default_trunk_class),
             features_extractor_kwargs=features_extractor_kwargs,
             normalize_images=normalize_images,
-            optimizer_class=optimizer_class,
+            optimizer_class=find_optimizer(optimizer_class),
             optimizer_kwargs=optimizer_kwargs,
             **stock_kwargs,
         )
@@ -205,7 +211,7 @@ class EqRPolicy(BasePolicy):
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """The given features extractor as trunk, the group encoder behind it; ``group=None`` leaves the trunk alone."""
         trunk_kwargs = dict(self.features_extractor_kwargs)
-        if not self.normalize_images and issubclass(self.features_extractor_class, ConvExtractor):
+        if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
         if self.group is None:
             return self.features_extractor_class(self.observation_space, **trunk_kwargs)
@@ -257,6 +263,10 @@ class EqRPolicy(BasePolicy):
             parameters += self.own_projection.parameters()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.add_param_group({"params": parameters})
+        _decay_matrices_only(self.optimizer)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)
 
     @property
     def project(self) -> Projection:
@@ -278,6 +288,29 @@ class EqRPolicy(BasePolicy):
             polyak_update(online.parameters(), target.parameters(), tau)
             # Running statistics are copied, see https://github.com/DLR-RM/stable-baselines3/issues/996
             polyak_update(get_parameters_by_name(online, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+
+    def reset_parameters(self, shrink_factor: float) -> None:
+        """
+        Against lost plasticity: the Q head (and the AET loss's own projection) is drawn afresh (Nikishin et al. 2022,
+        https://arxiv.org/abs/2205.07802); encoder and latent model become α old + (1 - α) fresh (shrink and perturb, Ash
+        and Adams 2020, https://arxiv.org/abs/1910.08475; for the encoder in SR-SPR and BBF). Batch statistics stay. The
+        optimiser forgets its state, and the target copy becomes one of the new parameters.
+
+        :param shrink_factor: α in [0, 1]
+        """
+        fresh = type(self)(**self._get_constructor_parameters()).to(self.device)
+        with th.no_grad():
+            for old, new in (
+                (self.online.features_extractor, fresh.online.features_extractor),
+                (self.latent_model, fresh.latent_model),
+            ):
+                for parameter, drawn in zip(old.parameters(), new.parameters(), strict=True):
+                    parameter.copy_(shrink_factor * parameter + (1 - shrink_factor) * drawn)
+            self.online.head.load_state_dict(fresh.online.head.state_dict())
+            if self.own_projection is not None and fresh.own_projection is not None:
+                self.own_projection.load_state_dict(fresh.own_projection.state_dict())
+        self.optimizer.state.clear()
+        self.update_target(1.0)
 
     def _target_pairs(self) -> list[tuple[nn.Module, nn.Module]]:
         pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
@@ -308,9 +341,31 @@ class EqRPolicy(BasePolicy):
             noisy=self.noisy,
             sigma_init=self.sigma_init,
             shared_projection=self.shared_projection,
+            act_with_target=self.act_with_target,
             reward_loss=self.reward_loss,
         )
         return data
+
+
+def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
+    """
+    :param optimizer: a class, or its name in ``torch.optim``
+    :raises ValueError: for an unknown name
+    """
+    if not isinstance(optimizer, str):
+        return optimizer
+    found = getattr(th.optim, optimizer, None)
+    if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
+        raise ValueError(f"optimizer_class: expected a class or a name in torch.optim such as 'AdamW', found {optimizer!r}")
+    return found
+
+
+def _decay_matrices_only(optimizer: th.optim.Optimizer) -> None:
+    for group in list(optimizer.param_groups):
+        if group.get("weight_decay"):
+            vectors = [parameter for parameter in group["params"] if parameter.ndim < 2]
+            group["params"] = [parameter for parameter in group["params"] if parameter.ndim >= 2]
+            optimizer.add_param_group({**group, "params": vectors, "weight_decay": 0.0})
 
 
 def _frozen_copy(module: Module) -> Module:

@@ -36,15 +36,14 @@ class UpdateMonitor:
     The losses of an update are computed before its step, so the first update of a round is what tells whether the
     round before left a sound model. That is why the starts of two rounds are kept.
 
-    :param names: of the figures
     :param model: whose parameters and buffers are kept
     :param optimizer: whose state is kept
     """
 
-    def __init__(self, names: tuple[str, ...], model: nn.Module, optimizer: th.optim.Optimizer):
-        self.names = names
+    def __init__(self, model: nn.Module, optimizer: th.optim.Optimizer):
         self._model = model
         self._optimizer = optimizer
+        self._names: list[str] = []
         self._pending: list[th.Tensor] = []  # (len(names),) each
         self._start: Backup | None = None  # of the last round
         self._sound_start: Backup | None = None  # of the round before: its figures are known to be finite
@@ -64,11 +63,12 @@ class UpdateMonitor:
             th._foreach_copy_([*kept[0], *kept[1].values()], [*model, *(state[key] for key in kept[1])])
         self._start = Backup(n_updates, *kept)
 
-    def add(self, figures: list[th.Tensor]) -> None:
+    def add(self, figures: dict[str, th.Tensor]) -> None:
         """
-        :param figures: of one update, scalars, in the order of ``names``
+        :param figures: of one update, scalars; the names are the same for all updates of a round
         """
-        self._pending.append(th.stack(figures))
+        self._names = list(figures)
+        self._pending.append(th.stack(list(figures.values())))
 
     def collect(self) -> dict[str, float]:
         """
@@ -80,16 +80,16 @@ class UpdateMonitor:
         if not self._pending:
             return {}
         assert self._start is not None
-        figures = th.stack(self._pending).cpu().numpy()  # (updates, names)
+        figures = th.stack(self._pending).cpu().numpy()  # (updates, figures)
         self._pending.clear()
         finite = np.isfinite(figures)
         if finite.all():
-            return dict(zip(self.names, figures.mean(axis=0, dtype=np.float64).tolist(), strict=True))
+            return dict(zip(self._names, figures.mean(axis=0, dtype=np.float64).tolist(), strict=True))
         first = int(np.argmin(finite.all(axis=1)))
         bad_update = self._start.n_updates + first + 1
         sound = self._start if first > 0 or self._sound_start is None else self._sound_start
         self._put_back(sound)
-        wrong = [f"{n} = {v}" for n, v, ok in zip(self.names, figures[first], finite[first], strict=True) if not ok]
+        wrong = [f"{n} = {v}" for n, v, ok in zip(self._names, figures[first], finite[first], strict=True) if not ok]
         raise BadUpdateError(
             f"update {bad_update}: expected finite losses, found {', '.join(wrong)}. "
             f"The model was put back to update {sound.n_updates} and can be saved. "
@@ -104,8 +104,11 @@ class UpdateMonitor:
         state = self._optimizer_tensors()
         for parameter in {parameter for parameter, _ in state.keys() - backup.optimizer.keys()}:
             del self._optimizer.state[parameter]  # it had none then
-        for key, tensor in backup.optimizer.items():
-            state[key].copy_(tensor)
+        for (parameter, name), tensor in backup.optimizer.items():
+            if (parameter, name) in state:
+                state[parameter, name].copy_(tensor)
+            else:  # a reset of the agent has cleared it since
+                self._optimizer.state[parameter][name] = tensor.clone()
 
     def _model_tensors(self) -> list[th.Tensor]:
         return [*(parameter.detach() for parameter in self._model.parameters()), *self._model.buffers()]

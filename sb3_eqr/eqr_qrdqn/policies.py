@@ -25,7 +25,7 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
         return self.head(self.features(obs), noisy)
 
     @property
-    def n_quantiles(self) -> int:
+    def n_quantiles(self) -> int:  # type: ignore[override]
         """As in ``sb3_contrib``'s network."""
         return self.n_atoms
 

@@ -1,0 +1,92 @@
+import warnings
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.dqn import DQN
+
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.losses import categorical_loss, categorical_projection
+from sb3_eqr.eqr_rainbow.policies import CnnPolicy, EqRCategoricalNetwork, EqRRainbowPolicy, MlpPolicy, MultiInputPolicy
+
+
+class EqRRainbow(EqRAlgorithm, DQN):
+    """
+    Equivariant representations for RL (EqR) on a Rainbow-style categorical agent: the agent of the paper.
+    Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
+    the categorical head (C51) is of https://arxiv.org/abs/1707.06887, its combination with double Q, dueling, noisy
+    layers, prioritised replay and n-step returns of https://arxiv.org/abs/1710.02298.
+
+    The parameters are those of :class:`~sb3_eqr.common.eqr_arguments.EqRArguments` (``help(EqRRainbow.__init__)``), with
+    the values of the paper for Atari 100K (Table 5) as defaults.
+
+    The support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), group, number of blocks, dueling and noisy
+    layers are set by ``policy_kwargs``, see :class:`~sb3_eqr.eqr_rainbow.policies.EqRRainbowPolicy`. The default support
+    is for rewards clipped to [-1, 1]; returns beyond it are warned of.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: EqRRainbowPolicy  # type: ignore[assignment]
+    q_net: EqRCategoricalNetwork
+    q_net_target: EqRCategoricalNetwork
+    target_update_interval: int | None  # type: ignore[assignment]
+    max_grad_norm: float | None  # type: ignore[assignment]
+    _warned_of_returns = False
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        # Discounted return of each environment's episode so far, and γ to its length.
+        self._returns, self._powers = np.zeros(self.n_envs), np.ones(self.n_envs)
+        return super()._setup_learn(*args, **kwargs)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        settled = self._vec_normalize_env is None or self.num_timesteps > self.learning_starts  # its scale moves at first
+        if settled and not self._warned_of_returns:
+            self._watch_returns(reward, dones)
+
+    def _watch_returns(self, reward: np.ndarray, dones: np.ndarray) -> None:
+        """
+        Warn, once, of a return that the support cannot hold.
+
+        :param reward: as the agent learns from it, (n_envs,)
+        :param dones: (n_envs,)
+        """
+        v_min, v_max = self.policy.v_min, self.policy.v_max
+        self._returns += self._powers * reward
+        beyond = (self._returns < v_min) | (self._returns > v_max)
+        if beyond.any():
+            self._warned_of_returns = True
+            warnings.warn(
+                f"step {self.num_timesteps}: an episode's discounted return is {self._returns[beyond][0]:.4g}, but the agent's"
+                f" return distribution ends at [v_min, v_max] = [{v_min}, {v_max}]: it cannot tell such returns apart. "
+                "Pass policy_kwargs=dict(v_min=..., v_max=...) that hold them, or scale the rewards (VecNormalize)."
+            )
+        self._powers *= self.gamma
+        self._returns[dones] = 0.0
+        self._powers[dones] = 1.0
+
+    def _td_loss(
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        network = self.policy.target
+        with th.no_grad():
+            values = rewards + discounts * network.support  # (B, N)
+            target = categorical_projection(values, following.softmax(dim=1), network.v_min, network.v_max)
+        return categorical_loss(current, target)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_returns", "_powers", "_warned_of_returns"]

@@ -1,0 +1,135 @@
+"""Policies of EqRRainbow: those of SB3's DQN with a group encoder, a dueling noisy categorical head and a latent model."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.features_extractor import ConvExtractor
+from sb3_eqr.common.policies import EqRNetwork, EqRPolicy
+
+
+class EqRCategoricalNetwork(EqRNetwork, QNetwork):
+    """
+    Features extractor and categorical head: the probabilities of N evenly spaced returns, per action (C51).
+
+    :param v_min: the lowest return
+    :param v_max: the highest return
+    :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRNetwork`
+    """
+
+    support: th.Tensor  # (N,)
+
+    def __init__(self, *args: Any, v_min: float, v_max: float, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.v_min = v_min
+        self.v_max = v_max
+        self.register_buffer("support", th.linspace(v_min, v_max, self.n_atoms), persistent=False)
+
+    def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
+        """
+        :param obs: (B, *obs_shape), or a dict of these
+        :param noisy: whether to draw noise in noisy layers
+        :return: Q values, (B, n_actions)
+        """
+        return self.expectation(self.head(self.features(obs), noisy))
+
+    def log_probs(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
+        """
+        :param obs: (B, *obs_shape), or a dict of these
+        :param noisy: whether to draw noise in noisy layers
+        :return: log-probabilities of the returns in ``support``, (B, n_atoms, n_actions)
+        """
+        return self.head(self.features(obs), noisy).log_softmax(dim=1)
+
+    def expectation(self, outputs: th.Tensor) -> th.Tensor:
+        return th.einsum("bn...,n->b...", outputs.softmax(dim=1), self.support)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "v_min": self.v_min, "v_max": self.v_max}
+
+    # The support travels with the parameters: logits say nothing without it.
+    def get_extra_state(self) -> th.Tensor:
+        return th.tensor([self.v_min, self.v_max], dtype=th.float64)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        if state.tolist() != [self.v_min, self.v_max]:
+            raise ValueError(
+                f"return distribution: expected parameters for [v_min, v_max] = {[self.v_min, self.v_max]}, found parameters "
+                f"for {state.tolist()}. Build the model with v_min and v_max of the file, or use load(), which does."
+            )
+
+
+class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
+    """
+    Policy of EqRRainbow.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param n_atoms: number of atoms of the return distribution, ≥ 2; 51 in Table 5
+    :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017, §5)
+    :param v_max: the highest return, > ``v_min``; 10
+    :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
+    :raises ValueError: for an argument out of its range
+    """
+
+    q_net: EqRCategoricalNetwork
+    q_net_target: EqRCategoricalNetwork
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule,
+        n_atoms: int = 51,
+        v_min: float = -10.0,
+        v_max: float = 10.0,
+        **kwargs: Any,
+    ):
+        check_number("n_atoms", n_atoms, 2, whole=True)
+        check_number("v_min", v_min, -np.inf)
+        check_number("v_max", v_max, -np.inf)
+        if v_min >= v_max:
+            raise ValueError(
+                f"v_min: expected a number below v_max = {v_max}, found {v_min}. Pass the lowest possible return."
+            )
+        self.n_atoms = n_atoms
+        self.v_min = v_min
+        self.v_max = v_max
+        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+
+    @property
+    def online(self) -> EqRCategoricalNetwork:
+        return self.q_net
+
+    @property
+    def target(self) -> EqRCategoricalNetwork:
+        return self.q_net_target
+
+    def make_q_net(self) -> EqRCategoricalNetwork:
+        return self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        return {**data, "n_atoms": self.n_atoms, "v_min": self.v_min, "v_max": self.v_max}
+
+
+MlpPolicy = EqRRainbowPolicy
+
+
+class CnnPolicy(EqRRainbowPolicy):
+    """:class:`EqRRainbowPolicy` for images: the trunk is the paper's three convolutions. Same parameters."""
+
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = ConvExtractor
+
+
+class MultiInputPolicy(EqRRainbowPolicy):
+    """:class:`EqRRainbowPolicy` for dict observations: the trunk is SB3's ``CombinedExtractor``. Same parameters."""
+
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor

@@ -1,0 +1,33 @@
+"""Small agents of both algorithms, for tests that ask the same of each."""
+
+from dataclasses import dataclass
+
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+
+SMALL = {
+    "learning_starts": 40,
+    "buffer_size": 500,
+    "batch_size": 8,
+    "n_steps": 3,
+    "prediction_depth": 2,
+    "device": "cpu",
+    "seed": 0,
+}
+N_ATOMS = 9
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes small agents of one algorithm; the names of what differs between the algorithms."""
+
+    algorithm: type[EqRAlgorithm]
+    n_atoms_name: str
+
+    def __call__(self, env, policy="MlpPolicy", **kwargs) -> EqRAlgorithm:
+        network = {"net_arch": [32], "n_blocks": 3, "latent_hidden_dim": 16, self.n_atoms_name: N_ATOMS}
+        policy_kwargs = {**network, **kwargs.pop("policy_kwargs", {})}
+        return self.algorithm(policy, env, **{**SMALL, **kwargs}, policy_kwargs=policy_kwargs)
+
+
+MAKERS = [Maker(EqRQRDQN, "n_quantiles"), Maker(EqRRainbow, "n_atoms")]

@@ -1,0 +1,368 @@
+"""EqRRainbow's own parts, and the knobs of later work: each against numbers made by hand or by another way."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+
+from sb3_eqr.common.features_extractor import ConvExtractor, ImpalaExtractor
+from sb3_eqr.common.layers import ImpalaTrunk, NoisyLinear, rescaled
+from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
+from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
+from tests.models import MAKERS
+from tests.toys import ChainEnv, ImageEnv
+
+make_rainbow = MAKERS[1]
+
+
+# ---------------------------------------------------------------------------------------------- C51, double Q, dueling
+
+
+def hand_made_agent(**kwargs):
+    """Three atoms on [-1, 1], and heads whose outputs are their biases alone, whatever the state."""
+    network = {"n_atoms": 3, "v_min": -1.0, "v_max": 1.0, "net_arch": [], "noisy": False, "group": None}
+    settings = {"exploration_final_eps": 0.1, "prediction_depth": 0, **kwargs}
+    policy_kwargs = {**network, **settings.pop("policy_kwargs", {})}
+    return make_rainbow(ChainEnv(), policy_kwargs=policy_kwargs, **settings)
+
+
+def set_head(stream, probabilities):
+    """
+    :param probabilities: one row per action, three numbers each
+    """
+    logs = th.tensor(probabilities).log()  # (A, 3)
+    th.nn.init.zeros_(stream[-1].weight)
+    with th.no_grad():
+        stream[-1].bias.copy_(logs.T.flatten())  # (atoms, actions)
+
+
+@pytest.mark.parametrize("double_q, goal", [(True, [0.0, 0.375, 0.625]), (False, [0.0, 0.0, 1.0])])
+def test_double_q_by_hand(double_q, goal):
+    """
+    The online network prefers action 0, the target network action 2. The return is 0.5 and γ to its length 0.5, so the
+    atoms -1, 0, 1 move to 0, 0.5, 1. Of action 0's (1/4, 1/4, 1/2), the middle is halved between the atoms 0 and 1.
+    """
+    model = hand_made_agent(double_q=double_q, policy_kwargs={"dueling": False})
+    sure_of_1 = [1e-30, 1e-30, 1.0]
+    current = [0.5, 0.375, 0.125]
+    set_head(model.q_net.head.advantage, [[0.25, 0.25, 0.5], current, [0.5, 0.25, 0.25]])
+    set_head(model.q_net_target.head.advantage, [[0.25, 0.25, 0.5], [0.25, 0.5, 0.25], sure_of_1])
+    obs = th.zeros(1, 3)
+    one = th.ones(1, 1)
+    samples = SequenceReplayBufferSamples(obs, one.long(), obs, 0 * one, one / 2, one / 2, np.zeros(1, int), th.ones(1))
+    td, _ = model._compute_losses(samples)
+    cross_entropy = -sum(g * math.log(c) for g, c in zip(goal, current, strict=True))
+    entropy = -sum(g * math.log(g) for g in goal if g > 0)
+    assert td.loss.item() == pytest.approx(cross_entropy, rel=1e-5)
+    assert td.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
+    assert td.q_values.item() == pytest.approx(-0.5 + 0.125)
+    terminal, _ = model._compute_losses(samples._replace(dones=one))  # all mass on 0.5: half to 0, half to 1
+    assert terminal.loss.item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
+
+
+def test_dueling_by_hand():
+    """
+    Value logits (ln 2, 0, 0); advantages (ln 2, 0, 0), 0 and 0, with the mean (ln 2 / 3, 0, 0). So the logits of atom -1
+    are 5/3 ln 2 for action 0 and 2/3 ln 2 for the others, and all else is 0.
+    """
+    model = hand_made_agent(policy_kwargs={"dueling": True})
+    set_head(model.q_net.head.value, [[2.0, 1.0, 1.0]])
+    set_head(model.q_net.head.advantage, [[2.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    weights = [2 ** (5 / 3), 2 ** (2 / 3), 2 ** (2 / 3)]
+    expected = [(1 - w) / (w + 2) for w in weights]
+    found = model.q_net(th.zeros(1, 3))
+    np.testing.assert_allclose(found.detach().numpy(), [expected], rtol=1e-5)
+    probabilities = model.q_net.log_probs(th.zeros(1, 3)).exp()  # (1, 3 atoms, 3 actions)
+    np.testing.assert_allclose(probabilities[0, :, 0].detach(), np.array([weights[0], 1, 1]) / (weights[0] + 2), rtol=1e-5)
+    assert model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0] in (1, 2)
+
+
+def test_q_values_are_expectations_of_the_log_probabilities():
+    model = make_rainbow(ChainEnv(), policy_kwargs={"v_min": -3.0, "v_max": 5.0}).learn(60)
+    obs = th.randn(7, 3)
+    with th.no_grad():
+        logs = model.q_net.log_probs(obs)
+        q_values = model.q_net(obs)
+    assert logs.shape == (7, 9, 3) and q_values.shape == (7, 3)
+    np.testing.assert_allclose(logs.exp().sum(dim=1), 1, rtol=1e-5)
+    by_hand = sum(logs[:, i].exp() * (-3.0 + i) for i in range(9))
+    th.testing.assert_close(q_values, by_hand, rtol=1e-5, atol=1e-5)
+    actions = model.predict(obs.numpy(), deterministic=True)[0]
+    assert actions.tolist() == by_hand.argmax(dim=1).tolist()
+    assert len(evaluate_policy(model, model.get_env(), n_eval_episodes=2, return_episode_rewards=True)[0]) == 2
+
+
+def test_the_return_distribution_is_learned():
+    """One state, one step: reward 1 with probability 1/4, else -1. A point estimate would say -0.5."""
+
+    class Coin(ChainEnv):
+        def step(self, action):
+            return self.observe(), 1.0 if self.rng.random() < 0.25 else -1.0, True, False, {}
+
+        def observe(self):
+            return np.zeros(3, dtype=np.float32)
+
+    settings = {"learning_starts": 400, "n_steps": 1, "prediction_depth": 0, "prioritized_replay": False, "batch_size": 64}
+    network = {"n_atoms": 5, "v_min": -2.0, "v_max": 2.0}  # atoms -2 ... 2
+    model = make_rainbow(Coin(), learning_rate=1e-2, gradient_steps=1, **settings, policy_kwargs=network).learn(700)
+    wins = float((model.replay_buffer.rewards[: model.replay_buffer.size()] == 1).mean())
+    found = model.q_net.log_probs(th.zeros(1, 3)).exp()[0].mean(dim=1)
+    np.testing.assert_allclose(found.detach(), [0, 1 - wins, 0, wins, 0], atol=0.08)
+
+
+# ---------------------------------------------------------------------------------------------- exploration
+
+
+def test_noise_explores_in_eval_mode_and_differs_from_step_to_step():
+    model = make_rainbow(ChainEnv(), learning_starts=0, exploration_initial_eps=0.0).learn(20)
+    model.policy.set_training_mode(False)  # as collect_rollouts does
+    obs = np.zeros((1, 3), dtype=np.float32)
+    assert all(isinstance(stream[0], NoisyLinear) for stream in (model.q_net.head.value, model.q_net.head.advantage))
+    with th.no_grad():
+        noisy = [model.q_net(th.zeros(1, 3), noisy=True) for _ in range(4)]
+        clean = [model.q_net(th.zeros(1, 3)) for _ in range(4)]
+    assert all(not th.equal(noisy[i], noisy[j]) for i in range(4) for j in range(i))
+    assert all(th.equal(clean[0], c) for c in clean)
+    assert len({int(model.predict(obs, deterministic=True)[0][0]) for _ in range(30)}) == 1
+
+
+def test_acting_with_the_target_network():
+    model = make_rainbow(ChainEnv(), tau=0.01, policy_kwargs={"act_with_target": True}).learn(200)
+    obs = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    with th.no_grad():
+        online, target = (net(th.as_tensor(obs)).argmax(dim=1).numpy() for net in (model.q_net, model.q_net_target))
+    assert (online != target).any()  # or nothing is shown here
+    assert np.array_equal(model.predict(obs, deterministic=True)[0], target)
+    model.policy.act_with_target = False
+    assert np.array_equal(model.predict(obs, deterministic=True)[0], online)
+
+
+# ---------------------------------------------------------------------------------------------- schedules
+
+
+def test_annealing_by_hand():
+    assert [anneal_n_steps(10, 3, p) for p in (0.0, 0.5, 1.0)] == [10, 5, 3]  # sqrt(30) = 5.48
+    assert [anneal_n_steps(3, 10, p) for p in (0.0, 0.5, 1.0)] == [3, 5, 10]
+    assert anneal_n_steps(None, 3, 0.2) == 3 and anneal_gamma(None, 0.9, 0.2) == 0.9
+    # 1 - γ from 0.03 to 0.003: half-way sqrt(0.03 * 0.003) = 0.00948683
+    np.testing.assert_allclose([anneal_gamma(0.97, 0.997, p) for p in (0.0, 0.5)], [0.97, 0.99051317], rtol=1e-7)
+    assert anneal_gamma(0.97, 0.997, 1.0) == 0.997
+
+
+def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
+    """Every draw is watched: its n, its γ, and whether the returns in it are those of that n and γ."""
+    model = make(
+        ChainEnv(), initial_n_steps=8, n_steps=2, initial_gamma=0.5, gamma=0.95, annealing_steps=20, reset_interval=40, seed=1
+    )
+    buffer, used = model.replay_buffer, []
+    gather = buffer._gather
+
+    def watched(positions, envs, *args):
+        samples = gather(positions, envs, *args)
+        used.append((model._n_updates, buffer.n_steps, buffer.gamma))
+        for position, found, discount in zip(positions, samples.rewards[:, 0], samples.discounts[:, 0], strict=True):
+            total, power = 0.0, 1.0
+            for step in range(buffer.n_steps):
+                total += power * buffer.rewards[position + step, 0]
+                power *= buffer.gamma
+                if buffer.dones[position + step, 0]:
+                    break
+            assert found.item() == pytest.approx(total, rel=1e-4, abs=1e-6) and discount.item() == pytest.approx(
+                power, rel=1e-5
+            )
+        return samples
+
+    monkeypatch.setattr(buffer, "_gather", watched)
+    model.learn(120)
+    assert model._resets == [40, 80, 120]
+    assert [update for update, _, _ in used] == list(range(model._n_updates))
+    for update, n_steps, gamma in used:
+        share = min(update % 40, 20) / 20 if update < 160 else 1.0
+        if update < 160:
+            assert n_steps == round(8 * 0.25**share)
+            assert gamma == pytest.approx(1 - 0.5 * 0.1**share)
+    assert {n for _, n, _ in used} == {8, 7, 6, 5, 4, 3, 2}
+
+
+def test_constant_n_and_gamma_are_left_alone(make):
+    model = make(ChainEnv()).learn(60)
+    assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.99)
+
+
+def test_importance_weights_of_bbf(make):
+    """β stays at 1/2: weights are 1/√P over their maximum."""
+    model = make(ChainEnv(), priority_beta=0.5, priority_final_beta=0.5).learn(120)
+    assert model.replay_buffer.beta == 0.5
+    samples = model.replay_buffer.sample(64)
+    found = model.replay_buffer._tree.get(samples.indices)
+    expected = 1 / np.sqrt(found)
+    np.testing.assert_allclose(samples.weights, expected / expected.max(), rtol=1e-5)
+
+
+def test_beta_may_fall(make):
+    model = make(ChainEnv(), priority_beta=0.8, priority_final_beta=0.2).learn(100)
+    assert model.replay_buffer.beta == pytest.approx(0.2)
+    model._current_progress_remaining = 0.5
+    model.train(1, 8)
+    assert model.replay_buffer.beta == pytest.approx(0.5)
+
+
+# ---------------------------------------------------------------------------------------------- resets
+
+
+@pytest.mark.parametrize("shared_projection", [True, False])
+@pytest.mark.parametrize("alpha", [0.5, 0.2, 0.0, 1.0])
+def test_a_reset_to_the_last_bit(make, alpha, shared_projection):
+    network = {"shared_projection": shared_projection}
+    model = make(ChainEnv(), reset_interval=60, reset_shrink_factor=alpha, tau=0.1, policy_kwargs=network).learn(70)
+    assert model._n_updates == 60 and model._resets == []  # the next update comes after a reset
+    old = {name: p.clone() for name, p in model.policy.state_dict().items()}
+    state = th.get_rng_state()
+    fresh = make(ChainEnv(), policy_kwargs=network)  # takes its seed: put the generator where the reset will find it
+    th.set_rng_state(state)
+    drawn = type(model.policy)(model.observation_space, model.action_space, lambda _: 0.0, **fresh.policy_kwargs).state_dict()
+    th.set_rng_state(state)
+    model._reset()
+    new = model.policy.state_dict()
+    online = "q_net" if make is make_rainbow else "quantile_net"
+    kinds = {"fresh": 0, "perturbed": 0, "kept": 0}
+    for name, value in new.items():
+        if "_target" in name or "extra_state" in name:
+            continue
+        if ".head." in name or name.startswith("own_projection."):
+            assert th.equal(value, drawn[name]) and not th.equal(value, old[name])
+            kinds["fresh"] += 1
+        elif "running_" in name or "num_batches" in name:
+            assert th.equal(value, old[name])
+            kinds["kept"] += 1
+        else:
+            assert name.startswith((f"{online}.features_extractor.", "latent_model."))
+            assert th.equal(value, alpha * old[name] + (1 - alpha) * drawn[name]), name
+            kinds["perturbed"] += 1
+    assert min(kinds.values()) > 0
+    assert len(model.policy.optimizer.state) == 0
+    for online_part, target_part in model.policy._target_pairs():  # the target follows
+        for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
+            assert th.equal(a, b)
+    before = {name: p.clone() for name, p in new.items()}
+    model.learn(60, reset_num_timesteps=False)  # and training goes on
+    still = [n for n, p in model.policy.named_parameters() if p.requires_grad and th.equal(before[n], p)]
+    assert still == [] and all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def test_when_resets_happen(make):
+    model = make(ChainEnv(), reset_interval=30, reset_fraction=0.7).learn(140)  # 200 updates in steps 41 to 140
+    assert model._n_updates == 200
+    assert model._resets == [30, 60, 90]  # 70 % of 140 steps are over after 116 updates
+    assert make(ChainEnv(), reset_interval=7, gradient_steps=3).learn(60)._resets == [7, 14, 21, 28, 35]  # within rounds
+    assert make(ChainEnv()).learn(60)._resets == []
+    assert make(ChainEnv(), reset_interval=30, reset_fraction=0.0).learn(100)._resets == []
+
+
+def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make):
+    model = make(ChainEnv(), reset_interval=40).learn(60)
+    assert model._n_updates == 40 and model._resets == []
+    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
+    slots = {id(p): {k: v.clone() for k, v in state.items()} for p, state in model.policy.optimizer.state.items()}
+    model._current_progress_remaining = 0.5
+    model.replay_buffer.rewards[:] = 1e38
+    model.train(gradient_steps=2, batch_size=8)
+    assert model._resets == [40]
+    with pytest.raises(FloatingPointError, match="put back to update"):
+        model.dump_logs()
+    assert model._resets == [] and model._n_updates <= 40
+    model.replay_buffer.rewards[:] = 0.0
+    if model._n_updates == 40:
+        assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
+        found = model.policy.optimizer.state
+        assert len(found) == len(slots)
+        assert all(th.equal(found[p][k], slots[id(p)][k]) for p in found for k in found[p])
+    model.train(gradient_steps=2, batch_size=8)
+    model.dump_logs()
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+# ---------------------------------------------------------------------------------------------- optimiser, trunk
+
+
+@pytest.mark.parametrize("name", ["AdamW", th.optim.AdamW])
+def test_weight_decay_reaches_matrices_only(make, name):
+    """With a learning rate of 1, no gradient and a decay of 1/4, one step leaves 3/4 of what decays."""
+    network = {"optimizer_class": name, "optimizer_kwargs": {"eps": 1.5e-4, "weight_decay": 0.25}}
+    model = make(ChainEnv(), learning_rate=1.0, policy_kwargs=network)
+    optimizer = model.policy.optimizer
+    assert isinstance(optimizer, th.optim.AdamW) and optimizer.defaults["eps"] == 1.5e-4
+    with th.no_grad():
+        for p in model._trained:
+            p.grad = th.zeros_like(p)
+            p.fill_(1.0)
+    optimizer.step()
+    assert {p.ndim for p in model._trained} == {1, 2}
+    for p in model._trained:
+        assert (p == (0.75 if p.ndim == 2 else 1.0)).all()
+    trained = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    assert trained == {id(p) for p in [*model.policy.online.parameters(), *model.policy.latent_model.parameters()]}
+    model.set_logger(configure(None, []))
+    model.lr_schedule = lambda progress: 0.125
+    model._update_learning_rate(optimizer)
+    assert {group["lr"] for group in optimizer.param_groups} == {0.125}
+
+
+def test_impala_is_the_network_of_the_paper():
+    """Espeholt et al. 2018: 15 convolutions in 3 stages, pooled by 2 each; counted by hand."""
+    trunk = ImpalaTrunk(4)
+    convolutions = [m for m in trunk.modules() if isinstance(m, th.nn.Conv2d)]
+    assert len(convolutions) == 15
+    widths = [(4, 16), (16, 32), (32, 32)]
+    expected = sum(9 * a * b + b + 4 * (9 * b * b + b) for a, b in widths)
+    assert sum(p.numel() for p in trunk.parameters()) == expected
+    assert trunk(th.rand(2, 4, 84, 84)).shape == (2, 32 * 11 * 11)
+    assert ImpalaTrunk(4, width_scale=4)(th.rand(1, 4, 36, 36)).shape == (1, 128 * 5 * 5)
+    assert ImpalaTrunk(4, width_scale=0.5)(th.rand(1, 4, 36, 36)).shape == (1, 16 * 5 * 5)
+    assert (trunk(th.rand(2, 4, 40, 40)) >= 0).all()
+    x = th.rand(2, 4, 20, 20)
+    by_hand = x
+    for stage in range(3):
+        conv, _, *blocks = list(trunk)[4 * stage : 4 * stage + 4]
+        by_hand = th.nn.functional.max_pool2d(conv(by_hand), 3, 2, 1)
+        for block in blocks:
+            by_hand = by_hand + block.conv2(block.conv1(by_hand.clamp(min=0)).clamp(min=0))
+    th.testing.assert_close(trunk(x), by_hand.clamp(min=0).flatten(1), rtol=1e-4, atol=1e-6)
+
+
+def test_latents_are_scaled_to_the_unit_interval():
+    features = th.tensor([[1.0, 3.0, 2.0], [-5.0, -5.0, 15.0], [4.0, 4.0, 4.0]])
+    expected = th.tensor([[0.0, 1.0, 0.5], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    th.testing.assert_close(rescaled(features), expected, rtol=1e-4, atol=1e-4)
+    space = ImageEnv((3, 40, 36)).observation_space
+    for extractor in (ImpalaExtractor(space, rescale=True, width_scale=0.5), ConvExtractor(space, rescale=True)):
+        found = extractor(th.rand(4, 3, 40, 36))
+        assert found.amin() >= 0 and found.amax() <= 1 and (found.amax(dim=1) > 0.99).all() and found.shape[1] > 50
+
+
+@pytest.mark.parametrize("group", ["SE(2)", None])
+def test_trunks_by_name(make, group):
+    network = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}, "group": group}
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, get_coef=0.0).learn(60)
+    encoder = model.policy.online.features_extractor
+    assert isinstance(encoder if group is None else encoder.trunk, ImpalaExtractor)
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def test_filters_of_ones_own():
+    """The two 5x5 convolutions of data-efficient Rainbow."""
+    space = ImageEnv((4, 84, 84)).observation_space
+    extractor = ConvExtractor(space, layers=[[32, 5, 5], [64, 5, 5]])
+    assert extractor.features_dim == 64 * 3 * 3
+    with pytest.raises(ValueError, match="at least 25x25 pixels, found 24x24"):
+        ConvExtractor(ImageEnv((4, 24, 24)).observation_space, layers=[[32, 5, 5], [64, 5, 5]])
+
+
+def test_no_warning_of_greed_where_resets_explore():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_rainbow(ChainEnv(), reset_interval=100, policy_kwargs={"noisy": False})
