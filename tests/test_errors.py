@@ -243,4 +243,4 @@ def test_returns_that_the_support_cannot_hold_are_warned_of_once():
         warnings.simplefilter("error")
         EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(60)
         scaled = VecNormalize(make_vec_env(lambda: gym.make("CartPole-v1"), 2), norm_reward=True)
-        EqRRainbow("MlpPolicy", scaled, **{**kwargs, "learning_starts": 100}).learn(400)
+        EqRRainbow("MlpPolicy", scaled, **{**kwargs, "learning_starts": 100}).learn(200)

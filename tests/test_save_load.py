@@ -15,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
+from tests.models import MAKERS
 from tests.resume import Save, make_env
 from tests.toys import ChainEnv, ImageEnv
 
@@ -191,7 +192,11 @@ KNOBS = {  # two resets after the file is written, one before; n and γ on their
 }
 
 
-@pytest.mark.parametrize("normalize, knobs", [(False, {}), (True, {}), (False, KNOBS)])
+@pytest.mark.parametrize(
+    "make, normalize, knobs",
+    [(MAKERS[0], False, {}), (MAKERS[0], True, {}), (MAKERS[1], False, {}), (MAKERS[1], False, KNOBS)],
+    indirect=["make"],
+)
 def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, tmp_path):
     """Saved after 120 of 240 steps, loaded in a new process, continued: the same parameters to the last bit."""
     model = make(make_env(normalize), buffer_size=200, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
