@@ -1,8 +1,10 @@
 """
-EqRQRDQN on one Atari game, from training to a picture.
+An EqR agent on one Atari game, from training to a picture.
 
-    python examples/demo.py --game Pong                       # as many steps as fit into --minutes
+    python examples/demo.py --game Pong                       # EqRQRDQN, as many steps as fit into --minutes
     python examples/demo.py --game Boxing --steps 100000      # the real thing
+    python examples/demo.py --config eqr_rainbow --steps 3000
+    python examples/demo.py --config eqr_bbf --width-scale 1 --steps 3000    # narrow enough for two cores
 
 Leaves model.zip, progress.csv and training.png in --out.
 """
@@ -18,7 +20,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
-from sb3_eqr import EqRQRDQN
+from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.envs.atari import atari_env_id
 
@@ -57,11 +61,25 @@ class Demo(BaseCallback):
         return self.deadline is None or time.monotonic() < self.deadline
 
 
-def steps_that_fit(game: str, seconds: float) -> int:
+def make_model(config: str, width_scale: float | None, game: str, seed: int, **changes) -> EqRAlgorithm:
+    """
+    :param config: a file in zoo_hyperparams
+    :param width_scale: of an "impala" trunk; its head is 512 times as wide, as BBF's is
+    """
+    settings = {**load_configuration(config), **changes}
+    if width_scale is not None:
+        network = settings["policy_kwargs"]
+        network["features_extractor_kwargs"]["width_scale"] = width_scale
+        network["net_arch"] = [round(512 * width_scale)]
+    algorithm = EqRQRDQN if config == "eqr_qrdqn" else EqRRainbow
+    return algorithm("CnnPolicy", make_atari100k_env(game, seed=seed), seed=seed, **settings)
+
+
+def steps_that_fit(config: str, width_scale: float | None, game: str, seconds: float) -> int:
     """
     :return: how many steps a run of so many seconds has here, by the speed of a few updates
     """
-    model = EqRQRDQN("CnnPolicy", make_atari100k_env(game, seed=0), learning_starts=30, buffer_size=100, seed=0)
+    model = make_model(config, width_scale, game, 0, learning_starts=30, buffer_size=100)
     model.learn(36)  # warm up
     start = time.monotonic()
     model.learn(12, reset_num_timesteps=False)
@@ -116,6 +134,8 @@ def main() -> None:
     """Train, evaluate, save, draw."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--game", default="Pong")
+    parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn")
+    parser.add_argument("--width-scale", type=float, help="of eqr_bbf's networks, 4 in the paper")
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
     parser.add_argument("--minutes", type=float, default=5.5)
     parser.add_argument("--eval-episodes", type=int, default=3)
@@ -127,11 +147,11 @@ def main() -> None:
     seconds, start = None, time.monotonic()
     if args.steps is None:
         seconds = args.minutes * 60 - EVALUATION_SECONDS
-        args.steps = steps_that_fit(args.game, 0.9 * seconds)
+        args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}
-    print(f"{args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
+    print(f"{args.config} on {args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
 
-    model = EqRQRDQN("CnnPolicy", make_atari100k_env(args.game, seed=args.seed), seed=args.seed, **settings)
+    model = make_model(args.config, args.width_scale, args.game, args.seed, **settings)
     model.set_logger(configure(str(out), ["csv"]))
     demo = Demo(max(args.steps // 200, 20), None if seconds is None else seconds - (time.monotonic() - start))
     callbacks: list[BaseCallback] = [demo]
@@ -146,7 +166,7 @@ def main() -> None:
     env = make_atari100k_env(args.game, n_envs=args.eval_episodes, seed=args.seed + 10_000, training=False)
     scores, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
     print(f"score of {len(scores)} games after {model.num_timesteps} steps: mean {np.mean(scores):.1f}, each {scores}")
-    title = f"EqRQRDQN on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
+    title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
     progress = pd.read_csv(out / "progress.csv")
     draw(progress, demo.scores, float(np.mean(scores)), model.learning_starts, title, out / "training.png")
     print(f"{out}/model.zip, {out}/progress.csv, {out}/training.png; {(time.monotonic() - start) / 60:.1f} minutes")

@@ -3,6 +3,7 @@
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
+from sb3_eqr.configurations import load_configuration
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.eqr_rainbow import EqRRainbow
 
@@ -15,5 +16,6 @@ __all__ = [
     "MatrixLieGroup",
     "PrioritizedSequenceReplayBuffer",
     "SequenceReplayBuffer",
+    "load_configuration",
     "make_group",
 ]

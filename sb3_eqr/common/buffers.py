@@ -344,11 +344,11 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         """
         self._follow_window()
         leaves = self._tree.sample(batch_size, np.random.random_sample(batch_size))
-        n_starts = (self.size() - self.window + 1) * self.n_envs
-        probabilities = self._tree.get(leaves) / self._tree.total
-        weights = (n_starts * probabilities) ** -self.beta
+        priorities = self._tree.get(leaves)
+        # (N P(i))^-β over its maximum: N and the sum of priorities cancel.
+        weights = (priorities.min() / priorities) ** self.beta
         positions, envs = np.divmod(leaves, self.n_envs)
-        return self._gather(positions, envs, env, (weights / weights.max()).astype(np.float32))
+        return self._gather(positions, envs, env, weights.astype(np.float32))
 
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
         """
@@ -357,9 +357,11 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         """
         scaled = (priorities.cpu().numpy().astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
         finite = np.isfinite(scaled)
-        if finite.any():
-            self._tree.set(indices[finite], scaled[finite])
-            self._max_priority = max(self._max_priority, float(scaled[finite].max()))
+        if not finite.all():
+            indices, scaled = indices[finite], scaled[finite]
+        if len(scaled) > 0:
+            self._tree.set(indices, scaled)
+            self._max_priority = max(self._max_priority, float(scaled.max()))
 
     def _follow_window(self) -> None:
         """Open or close the youngest starts where n or M has moved."""

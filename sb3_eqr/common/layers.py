@@ -207,7 +207,7 @@ class ResidualBlock(nn.Module):
 
 def rescaled(features: th.Tensor) -> th.Tensor:
     """
-    Each sample's features shifted and scaled to [0, 1] (Schrittwieser et al. 2020, appendix G,
+    Each sample's features shifted and scaled to [0, 1] (Schrittwieser et al. 2020,
     https://arxiv.org/abs/1911.08265; SPR and BBF do so with their convolutions' output).
 
     :param features: (B, D)

@@ -1,4 +1,4 @@
-"""How the n-step return and the discount move after a reset (BBF, https://arxiv.org/abs/2305.19452, §3)."""
+"""How the n-step return and the discount move after a reset (BBF, https://arxiv.org/abs/2305.19452)."""
 
 
 def anneal_n_steps(initial: int | None, final: int, progress: float) -> int:

@@ -1,67 +1,53 @@
-"""A sum tree: draws in proportion to priorities in O(log N), for whole batches at once."""
+"""A sum tree: draws in proportion to priorities, for whole batches at once."""
 
 import numpy as np
+
+BLOCK = 64
 
 
 class SumTree:
     """
-    A complete binary tree in one array: node 1 is the root, node i has children 2i and 2i + 1, and the leaves are
-    the last ``capacity`` nodes, rounded up to a power of two. Inner nodes are recomputed from their children, never
-    incremented, so rounding errors do not pile up.
+    A tree of two levels: leaves, in blocks of 64, and the sum of each block. Wide and flat, because a batch costs a few
+    calls of NumPy per level, and a running sum over a block no more than one such call. Sums are recomputed,
+    never incremented, so rounding errors do not pile up.
 
     :param capacity: number of leaves, at least 1
     """
 
     def __init__(self, capacity: int):
         self.capacity = capacity
-        self._depth = max(capacity - 1, 0).bit_length()
-        self._first_leaf = 1 << self._depth
-        self._nodes = np.zeros(2 * self._first_leaf)
-
-    @property
-    def total(self) -> float:
-        """The sum of all priorities."""
-        return float(self._nodes[1])
+        self._leaves = np.zeros((-(-capacity // BLOCK), BLOCK))
+        self._sums = np.zeros(len(self._leaves))
 
     @property
     def nbytes(self) -> int:
         """Memory, in bytes."""
-        return self._nodes.nbytes
+        return self._leaves.nbytes + self._sums.nbytes
 
     def set(self, leaves: np.ndarray, priorities: np.ndarray | float) -> None:
         """
         :param leaves: indices in [0, capacity), (B,); where one is named twice, the last one counts
         :param priorities: non-negative, (B,) or one for all
         """
-        nodes = leaves + self._first_leaf
-        self._nodes[nodes] = priorities
-        for _ in range(self._depth):
-            nodes = nodes >> 1
-            self._nodes[nodes] = self._nodes[2 * nodes] + self._nodes[2 * nodes + 1]
+        self._leaves.ravel()[leaves] = priorities
+        blocks = leaves // BLOCK
+        self._sums[blocks] = self._leaves[blocks].sum(axis=1)
 
     def get(self, leaves: np.ndarray) -> np.ndarray:
         """
         :param leaves: indices in [0, capacity), (B,)
         :return: their priorities, (B,)
         """
-        return self._nodes[leaves + self._first_leaf]
+        return self._leaves.ravel()[leaves]
 
     def find(self, masses: np.ndarray) -> np.ndarray:
         """
         The leaf at which the running sum of priorities first exceeds each mass. A leaf of priority 0 is never found.
 
-        :param masses: numbers in [0, total), (B,)
+        :param masses: numbers from 0 to below the sum of all priorities, (B,)
         :return: leaves, (B,), int64
         """
-        nodes = np.ones(len(masses), dtype=np.int64)
-        masses = masses.copy()
-        for _ in range(self._depth):
-            left = self._nodes[2 * nodes]
-            # Rounding may leave a mass just above what is there: never walk into an empty subtree.
-            right = (masses >= left) & (self._nodes[2 * nodes + 1] > 0)
-            masses -= left * right
-            nodes = 2 * nodes + right
-        return nodes - self._first_leaf
+        return self._find(masses, self._running_sum())
 
     def sample(self, batch_size: int, uniforms: np.ndarray) -> np.ndarray:
         """
@@ -71,4 +57,18 @@ class SumTree:
         :param uniforms: random numbers in [0, 1), (B,)
         :return: leaves, (B,), int64
         """
-        return self.find((np.arange(batch_size) + uniforms) * (self.total / batch_size))
+        starts = self._running_sum()
+        return self._find((np.arange(batch_size) + uniforms) * (starts[-1] / batch_size), starts)
+
+    def _running_sum(self) -> np.ndarray:
+        starts = np.zeros(len(self._sums) + 1)
+        self._sums.cumsum(out=starts[1:])
+        return starts
+
+    def _find(self, masses: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        # Rounding may leave a mass just above what is there: never look behind the last priority above 0.
+        masses = np.minimum(masses, np.nextafter(starts[-1], 0))
+        blocks = starts.searchsorted(masses, side="right") - 1  # (B,)
+        inside = self._leaves[blocks].cumsum(axis=1)  # (B, BLOCK)
+        rest = np.minimum(masses - starts[blocks], np.nextafter(inside[:, -1], 0))
+        return blocks * BLOCK + (inside <= rest[:, None]).sum(axis=1)

@@ -73,7 +73,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param n_atoms: number of atoms of the return distribution, ≥ 2; 51 in Table 5
-    :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017, §5)
+    :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017)
     :param v_max: the highest return, > ``v_min``; 10
     :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
     :raises ValueError: for an argument out of its range

@@ -1,0 +1,58 @@
+"""The toy world of prioritised replay: success is one transition among exponentially many failures."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_eqr.common.checks import check_number
+
+
+class BlindCliffwalk(gym.Env):
+    """
+    The blind cliffwalk (Schaul et al. 2016, Figure 1, https://arxiv.org/abs/1511.05952): in each of n states one of two
+    actions leads on and the other ends the episode; only the right action in the last state is rewarded, with 1.
+    Random play gets there once in 2ⁿ episodes.
+
+    :param n_states: n ≥ 1
+    :param seed: draws the right action of each state
+    :raises ValueError: for a number of states below 1
+    """
+
+    def __init__(self, n_states: int = 10, seed: int = 0):
+        check_number("n_states", n_states, 1, whole=True)
+        self.n_states = n_states
+        self.observation_space = spaces.Discrete(n_states)
+        self.action_space = spaces.Discrete(2)
+        self.right_actions = np.random.default_rng(seed).integers(0, 2, n_states)
+        self.state = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
+        """
+        :return: the first state
+        """
+        super().reset(seed=seed)
+        self.state = 0
+        return self.state, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: 0 or 1
+        :return: the next state, or the last one seen where the episode ended; reward; whether it ended; no time-outs
+        """
+        if action != self.right_actions[self.state]:
+            return self.state, 0.0, True, False, {}
+        if self.state == self.n_states - 1:
+            return self.state, 1.0, True, False, {}
+        self.state += 1
+        return self.state, 0.0, False, False, {}
+
+    def q_values(self, gamma: float) -> np.ndarray:
+        """
+        :param gamma: γ
+        :return: the optimal Q values, (n_states, 2)
+        """
+        values = np.zeros((self.n_states, 2))
+        values[np.arange(self.n_states), self.right_actions] = gamma ** np.arange(self.n_states)[::-1]
+        return values
