@@ -142,7 +142,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
-    out = args.out or pathlib.Path("demo_results") / atari_env_id(args.game)[4:-3]
+    game = atari_env_id(args.game)[4:-3]
+    out = args.out or pathlib.Path("demo_results") / (game if args.config == "eqr_qrdqn" else f"{game}-{args.config}")
     settings: dict = {}
     seconds, start = None, time.monotonic()
     if args.steps is None:

@@ -12,38 +12,30 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import sb3_eqr
-from sb3_eqr import EqRQRDQN
+from sb3_eqr import EqRQRDQN, load_configuration
 from sb3_eqr.envs import make_atari100k_env
 
 ROOT = pathlib.Path(__file__).parent.parent
-ZOO_KEYS = {"policy", "n_timesteps", "frame_stack", "n_envs", "normalize"}  # read by RL Zoo itself
 
 
-def entries():
-    return yaml.safe_load((ROOT / "zoo_hyperparams" / "eqr_qrdqn.yml").read_text())
-
-
-@pytest.mark.parametrize("name", entries())
+@pytest.mark.parametrize("name", ["atari", "CartPole-v1"])
 def test_every_entry_fits_the_constructor(name):
-    entry = entries()[name]
-    kwargs = {key: value for key, value in entry.items() if key not in ZOO_KEYS}
-    if "policy_kwargs" in kwargs:
-        kwargs["policy_kwargs"] = eval(kwargs["policy_kwargs"])  # as RL Zoo does
-    env = make_atari100k_env("Pong") if name == "atari" else make_vec_env(name)
-    model = EqRQRDQN(entry["policy"], env, device="cpu", **kwargs)
+    kwargs = load_configuration("eqr_qrdqn", name)
+    env, policy = (make_atari100k_env("Pong"), "CnnPolicy") if name == "atari" else (make_vec_env(name), "MlpPolicy")
+    model = EqRQRDQN(policy, env, device="cpu", **kwargs)
     for key, value in kwargs.items():
         found = getattr(model, key)
         assert (found.frequency if key == "train_freq" else found) == value or key == "policy_kwargs"
+    entry = yaml.safe_load((ROOT / "zoo_hyperparams" / "eqr_qrdqn.yml").read_text())[name]
+    assert entry["policy"] == policy
     if name == "atari":
         assert isinstance(env, VecFrameStack) and env.stacked_obs.n_stack == entry["frame_stack"]
 
 
 def test_the_example_and_the_file_agree():
     source = (ROOT / "examples" / "cartpole.py").read_text()
-    settings = re.search(r"SETTINGS = (\{.*?\n\})", source, re.S)[1].replace("STEPS", "30_000")
-    entry = entries()["CartPole-v1"]
-    for key, value in ast.literal_eval(re.sub(r"#.*", "", settings)).items():
-        assert (eval(entry[key]) if key == "policy_kwargs" else entry[key]) == value
+    settings = re.search(r"^SETTINGS = (\{.*?\n\})", source, re.S | re.M)[1].replace("STEPS", "30_000")
+    assert ast.literal_eval(re.sub(r"#.*", "", settings)) == load_configuration("eqr_qrdqn", "CartPole-v1")
 
 
 def test_importing_needs_no_extra():
@@ -76,6 +68,7 @@ def test_readme_example_runs(tmp_path, monkeypatch):
 def test_speed_script_prints_its_table(tmp_path):
     command = [sys.executable, "-m", "sb3_eqr.benchmark.speed", "--threads", "1", "--rounds", "1"]
     shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
-    rows = [line.split() for line in shown.splitlines() if "QRDQN" in line]
-    assert [row[0] for row in rows] == ["QRDQN", "EqRQRDQN", "EqRQRDQN,"]
+    rows = [line.split() for line in shown.splitlines() if line.split("  ")[0].startswith(("QRDQN", "EqR"))]
+    assert [row[0] for row in rows] == ["QRDQN", "EqRQRDQN", "EqRRainbow", "EqRQRDQN,"]
+    assert "gradient step of EqRRainbow over that of EqRQRDQN: " in shown
     assert float(rows[1][-1]) <= 8_500 < 56_000 < float(rows[0][-1])

@@ -1,5 +1,5 @@
 """
-What a step costs: stock QRDQN and EqRQRDQN in turns, in one process, on the same 84×84×4 frames.
+What a step costs: stock QRDQN, EqRQRDQN and EqRRainbow in turns, in one process, on the same 84×84×4 frames.
 
     python -m sb3_eqr.benchmark.speed [--threads 1] [--rounds 30] [--large] [--json FILE]
 
@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
-from sb3_eqr import EqRQRDQN, PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 
 SIZE = 84
 N_STACK = 4
@@ -37,11 +37,12 @@ def make_env() -> VecEnv:
 
 
 def make_models() -> dict[str, OffPolicyAlgorithm]:
-    """Stock QRDQN with its defaults, and EqRQRDQN at Table 5 settings with and without its auxiliary losses."""
+    """Stock QRDQN with its defaults, and the EqR agents at Table 5 settings, one of them without auxiliary losses, too."""
     size = 3_000
     return {
         "QRDQN (stock)": QRDQN("CnnPolicy", make_env(), buffer_size=size, batch_size=BATCH_SIZE, seed=0),
         "EqRQRDQN": EqRQRDQN("CnnPolicy", make_env(), buffer_size=size, batch_size=BATCH_SIZE, seed=0),
+        "EqRRainbow": EqRRainbow("CnnPolicy", make_env(), buffer_size=size, batch_size=BATCH_SIZE, seed=0),
         "EqRQRDQN, depth 0": EqRQRDQN(
             "CnnPolicy", make_env(), buffer_size=size, batch_size=BATCH_SIZE, seed=0, prediction_depth=0
         ),
@@ -175,7 +176,15 @@ def main() -> None:
             f"{name:20}{row['ms_per_gradient_step']:18.1f}{row['best_ms']:8.1f}{row['ratio']:8.2f}"
             f"{row['env_steps_per_second']:13.0f}{row['bytes_per_transition']:18.0f}"
         )
-    result: dict = {"threads": args.threads, "rounds": args.rounds, "torch": th.__version__, "models": figures}
+    heads = float(np.median(np.array(timings["EqRRainbow"]) / np.array(timings["EqRQRDQN"])))
+    print(f"gradient step of EqRRainbow over that of EqRQRDQN: {heads:.2f}")
+    result: dict = {
+        "threads": args.threads,
+        "rounds": args.rounds,
+        "torch": th.__version__,
+        "models": figures,
+        "rainbow_over_qrdqn": heads,
+    }
     if args.large:
         result["sampling_ms"] = measure_sampling((10_000, 1_000_000), args.rounds)
         for way, row in result["sampling_ms"].items():

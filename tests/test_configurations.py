@@ -1,0 +1,148 @@
+"""Each named configuration is what the table in the docs says it is."""
+
+import pathlib
+import re
+
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecFrameStack
+
+from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
+from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
+from sb3_eqr.common.layers import ImpalaTrunk, NoisyLinear
+from sb3_eqr.configurations import configuration_files
+from tests.toys import ImageEnv
+
+ROOT = pathlib.Path(__file__).parent.parent
+SMALL = {"learning_starts": 50, "buffer_size": 400, "batch_size": 8, "device": "cpu", "seed": 0}
+
+# name: encoder, auxiliary losses
+EXPECTED = {
+    "eqr_rainbow": ("SE(2)^12", {"aet", "get", "reward"}),
+    "mlp+aet+r": ("none(512)^1", {"aet", "reward"}),
+    "t2+aet+r": ("T(2)^32", {"aet", "reward"}),
+    "se2+aet+r": ("SE(2)^12", {"aet", "reward"}),
+    "gl2+aet+r": ("GL(2)^12", {"aet", "reward"}),
+    "se2+aet": ("SE(2)^12", {"aet"}),
+    "se2+aet+get": ("SE(2)^12", {"aet", "get"}),
+    "se2+aet+r+get": ("SE(2)^12", {"aet", "get", "reward"}),
+    "rainbow": (None, set()),
+    "der": (None, set()),
+    "drq": (None, set()),
+    "spr": ("none(512)^1", {"aet"}),
+    "deepmdp": ("none(512)^1", {"aet", "reward"}),
+    "eqr_bbf": ("SE(2)^12", {"aet", "get", "reward"}),
+}
+
+
+def table():
+    """The rows of the docs: name -> arguments."""
+    text = (ROOT / "docs" / "configurations.md").read_text().split("## The knobs")[0]
+    rows = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", text, re.M)
+    return {name: eval(f"dict({arguments})") for name, arguments in rows}
+
+
+def test_the_table_and_the_files_agree():
+    files = {name for name, path in configuration_files().items() if path.parent.name == "ablations"}
+    assert table().keys() == files == EXPECTED.keys() - {"eqr_rainbow"}
+    for name, arguments in table().items():
+        assert arguments == load_configuration(name), name
+
+
+def test_the_full_agent_is_the_default_one():
+    """Every line of eqr_rainbow.yml repeats a default."""
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
+    default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
+    for key, value in load_configuration("eqr_rainbow").items():
+        if key not in ("policy_kwargs", "train_freq"):
+            assert getattr(default, key) == value, key
+    assert default.train_freq == named.train_freq
+    for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
+        found = getattr(default.policy, key)
+        assert (12 if found is None else found) == value  # n_blocks follows from the group
+
+
+def nonzero_gradients(module):
+    return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_each_is_trained_as_the_table_says(name):
+    arguments = load_configuration(name)
+    encoder_name, losses = EXPECTED[name]
+    network = {"latent_hidden_dim": 16, **arguments.pop("policy_kwargs", {})}
+    network["net_arch"] = [32]
+    if name == "eqr_bbf":
+        network["features_extractor_kwargs"]["width_scale"] = 0.25
+        assert arguments["reset_interval"] == 40_000 and arguments["annealing_steps"] == 10_000
+        arguments.update(reset_interval=120, annealing_steps=60)
+    kept = {key: value for key, value in arguments.items() if key not in SMALL}
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
+    model = EqRRainbow("CnnPolicy", env, **kept, **SMALL, policy_kwargs=network)
+    model.set_logger(configure(None, []))
+    recorded = {}
+    model.logger.dump = lambda step=0: recorded.update(model.logger.name_to_value)
+    before = {key: p.clone() for key, p in model.policy.online.named_parameters()}
+    model.learn(200, log_interval=1)
+
+    # arguments arrived
+    for key, value in kept.items():
+        assert (model.train_freq.frequency if key == "train_freq" else getattr(model, key)) == value
+    assert abs(model._n_updates - 150 * model.gradient_steps / model.train_freq.frequency) < 1
+    assert isinstance(model.replay_buffer, PrioritizedSequenceReplayBuffer) == (name != "drq")
+    encoder = model.policy.online.features_extractor
+    if encoder_name is None:
+        assert not isinstance(encoder, GroupFeaturesExtractor)
+    else:
+        assert f"{encoder.group}^{encoder.n_blocks}" == encoder_name
+    noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
+    assert noisy == (name not in ("drq", "eqr_bbf"))
+    assert model.policy.latent_model.n_actions == 3
+
+    # losses: those of the table are logged and finite, and no others
+    logged = {key[len("train/") : -len("_loss")] for key in recorded if key.endswith("_loss")}
+    assert logged == losses | {"td"}
+    assert all(th.isfinite(th.tensor(value)) for key, value in recorded.items() if key.startswith("train/"))
+
+    # gradients: each part is trained by the losses that it serves
+    latent = model.policy.latent_model
+    assert nonzero_gradients(encoder) and nonzero_gradients(model.policy.online.head)
+    assert nonzero_gradients(latent.transition) == bool(losses)
+    assert nonzero_gradients(latent.reward_net) == ("reward" in losses)
+    assert nonzero_gradients(latent.action_symmetry) == nonzero_gradients(latent.projection) == ("get" in losses)
+    assert all(p.grad is None for p in [*model.policy.target.parameters(), *model.policy.latent_model_target.parameters()])
+    assert all(not th.equal(before[key], p) for key, p in model.policy.online.named_parameters())
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def test_eqr_bbf_is_the_recipe():
+    """The figures of the paper, one by one, on the agent as it is built at full width."""
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
+    model = EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf"), device="cpu")
+    trunk = model.policy.online.features_extractor.trunk
+    assert isinstance(trunk.trunk, ImpalaTrunk) and trunk.rescale and trunk.features_dim == 11 * 11 * 32 * 4
+    head = model.policy.online.head
+    assert head.value is not None and head.advantage[0].out_features == 2048 and head.n_atoms == 51
+    assert (model.policy.v_min, model.policy.v_max) == (-10, 10)
+    rates = [model.exploration_schedule(1 - step / 100_000) for step in (0, 2_001, 50_000)]
+    assert rates == pytest.approx([1, 0, 0], abs=1e-12)
+    optimizer = model.policy.optimizer
+    assert isinstance(optimizer, th.optim.AdamW) and optimizer.defaults["eps"] == 1.5e-4 and model.learning_rate == 1e-4
+    decays = {p.ndim: group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
+    assert decays == {4: 0.1, 2: 0.1, 1: 0.0}
+    assert (model.tau, model.target_update_interval, model.max_grad_norm) == (0.005, None, None)
+    assert (model.priority_alpha, model.priority_beta, model.priority_final_beta) == (0.5, 0.5, 0.5)
+    assert (model.initial_n_steps, model.n_steps, model.initial_gamma, model.gamma) == (10, 3, 0.97, 0.997)
+    assert (model.annealing_steps, model.reset_interval, model.reset_shrink_factor) == (10_000, 40_000, 0.5)
+    assert (model.prediction_depth, model.aet_coef, model.get_coef) == (5, 5, 5)
+    assert (model.gradient_steps, model.train_freq.frequency, model.batch_size) == (2, 1, 32)
+    assert model.policy.act_with_target and model.double_q
+
+
+def test_unknown_names_are_told():
+    with pytest.raises(ValueError, match="expected one of .*'eqr_bbf'.*found 'bbf'"):
+        load_configuration("bbf")
+    with pytest.raises(ValueError, match="expected an entry of .*'atari'.*found 'CartPole-v1'"):
+        load_configuration("eqr_bbf", "CartPole-v1")
