@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 GAME ?= Pong
+CONFIG ?= eqr_qrdqn
 STEPS ?=
 
 .PHONY: demo test pytest format lint type commit-checks clean
@@ -13,7 +14,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: $(VENV)/installed
-	$(BIN)/python examples/demo.py --game "$(GAME)" $(if $(STEPS),--steps $(STEPS))
+	$(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(if $(STEPS),--steps $(STEPS))
 
 test: lint type pytest
 

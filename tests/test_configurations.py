@@ -142,7 +142,7 @@ def test_eqr_bbf_is_the_recipe():
 
 
 def test_unknown_names_are_told():
-    with pytest.raises(ValueError, match="expected one of .*'eqr_bbf'.*found 'bbf'"):
+    with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
         load_configuration("bbf")
-    with pytest.raises(ValueError, match="expected an entry of .*'atari'.*found 'CartPole-v1'"):
+    with pytest.raises(ValueError, match=r"expected an entry of .*'atari'.*found 'CartPole-v1'"):
         load_configuration("eqr_bbf", "CartPole-v1")
