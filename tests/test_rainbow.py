@@ -263,6 +263,16 @@ def test_when_resets_happen(make):
     assert make(ChainEnv(), reset_interval=30, reset_fraction=0.0).learn(100)._resets == []
 
 
+def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
+    """n jumps from 2 to 60 at the reset, and the buffer has 42 transitions."""
+    model = make(ChainEnv(), reset_interval=4, initial_n_steps=60, n_steps=2, annealing_steps=1, learning_starts=40)
+    model._resets.append(-1)  # annealed long ago
+    model.learn(50)
+    assert model._n_updates == 4 and model._resets == [-1, 4]
+    model.learn(20, reset_num_timesteps=False)
+    assert model._n_updates > 4
+
+
 def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make):
     model = make(ChainEnv(), reset_interval=40).learn(60)
     assert model._n_updates == 40 and model._resets == []

@@ -98,9 +98,10 @@ class EqRAlgorithm(EqRSetup):
                 self.logger.record(f"train/{name}", getattr(buffer, name))
 
     def _reset_is_due(self) -> bool:
-        done = 1.0 - self._current_progress_remaining
-        interval = self.reset_interval
-        return interval is not None and self._n_updates > 0 and self._n_updates % interval == 0 and done < self.reset_fraction
+        if self.reset_interval is None or self._n_updates == 0 or self._n_updates % self.reset_interval != 0:
+            return False
+        over = 1.0 - self._current_progress_remaining >= self.reset_fraction
+        return not over and self._resets[-1:] != [self._n_updates]
 
     def _reset(self) -> None:
         self.policy.reset_parameters(self.reset_shrink_factor)
