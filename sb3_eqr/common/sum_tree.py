@@ -2,21 +2,20 @@
 
 import numpy as np
 
-BLOCK = 64
-
 
 class SumTree:
     """
-    A tree of two levels: leaves, in blocks of 64, and the sum of each block. Wide and flat, because a batch costs a few
-    calls of NumPy per level, and a running sum over a block no more than one such call. Sums are recomputed,
-    never incremented, so rounding errors do not pile up.
+    A tree of two levels: leaves, in blocks of about √capacity / 4, and the sum of each block. Wide and flat, because a
+    batch costs a few calls of NumPy per level, and a running sum over a block hardly more than one such call. Sums are
+    recomputed, never incremented, so rounding errors do not pile up.
 
     :param capacity: number of leaves, at least 1
     """
 
     def __init__(self, capacity: int):
         self.capacity = capacity
-        self._leaves = np.zeros((-(-capacity // BLOCK), BLOCK))
+        self._block = 1 << max(capacity.bit_length() // 2 - 2, 4)
+        self._leaves = np.zeros((-(-capacity // self._block), self._block))
         self._sums = np.zeros(len(self._leaves))
 
     @property
@@ -30,7 +29,7 @@ class SumTree:
         :param priorities: non-negative, (B,) or one for all
         """
         self._leaves.ravel()[leaves] = priorities
-        blocks = leaves // BLOCK
+        blocks = leaves // self._block
         self._sums[blocks] = self._leaves[blocks].sum(axis=1)
 
     def get(self, leaves: np.ndarray) -> np.ndarray:
@@ -69,6 +68,6 @@ class SumTree:
         # Rounding may leave a mass just above what is there: never look behind the last priority above 0.
         masses = np.minimum(masses, np.nextafter(starts[-1], 0))
         blocks = starts.searchsorted(masses, side="right") - 1  # (B,)
-        inside = self._leaves[blocks].cumsum(axis=1)  # (B, BLOCK)
+        inside = self._leaves[blocks].cumsum(axis=1)  # (B, block)
         rest = np.minimum(masses - starts[blocks], np.nextafter(inside[:, -1], 0))
-        return blocks * BLOCK + (inside <= rest[:, None]).sum(axis=1)
+        return blocks * self._block + (inside > rest[:, None]).argmax(axis=1)  # the first True
