@@ -10,11 +10,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import ConvExtractor
-from sb3_eqr.common.policies import EqRNetwork, EqRPolicy
+from sb3_eqr.common.networks import EqRNetwork
+from sb3_eqr.common.policies import EqRPolicy
 
 
 class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
-    """Features extractor and quantile head. For the parameters see :class:`~sb3_eqr.common.policies.EqRNetwork`."""
+    """Features extractor and quantile head. For the parameters see :class:`~sb3_eqr.common.networks.EqRNetwork`."""
 
     def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
         """

@@ -11,7 +11,8 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import ConvExtractor
-from sb3_eqr.common.policies import EqRNetwork, EqRPolicy
+from sb3_eqr.common.networks import EqRNetwork
+from sb3_eqr.common.policies import EqRPolicy
 
 
 class EqRCategoricalNetwork(EqRNetwork, QNetwork):
@@ -20,7 +21,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
 
     :param v_min: the lowest return
     :param v_max: the highest return
-    :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRNetwork`
+    :param kwargs: the parameters of :class:`~sb3_eqr.common.networks.EqRNetwork`
     """
 
     support: th.Tensor  # (N,)

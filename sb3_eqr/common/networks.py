@@ -1,0 +1,91 @@
+"""What online and target networks of every EqR agent have in common."""
+
+from abc import abstractmethod
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_eqr.common.layers import DistributionalHead
+from sb3_eqr.common.type_aliases import PyTorchObs
+
+
+class EqRNetwork(BasePolicy):
+    """
+    A features extractor and a distributional head: an online or a target network.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param features_extractor: the group encoder
+    :param features_dim: D
+    :param net_arch: hidden sizes of the head
+    :param activation_fn: Activation function of the head
+    :param normalize_images: Whether to divide images by 255
+    :param n_atoms: N, how many numbers the head has per action: quantiles or atoms
+    :param dueling: whether the head splits value from advantage
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Discrete,
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module],
+        normalize_images: bool,
+        n_atoms: int,
+        dueling: bool,
+        sigma_init: float | None,
+    ):
+        # Not the constructor of the stock network beside it: that would build a head that is thrown away.
+        BasePolicy.__init__(
+            self,
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+        )
+        self.net_arch = net_arch
+        self.activation_fn = activation_fn
+        self.features_dim = features_dim
+        self.n_atoms = n_atoms
+        self.dueling = dueling
+        self.sigma_init = sigma_init
+        self.head = DistributionalHead(
+            features_dim, int(action_space.n), n_atoms, net_arch, activation_fn, dueling, sigma_init
+        )
+
+    def features(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: (B, *obs_shape), or a dict of these
+        :return: (B, D)
+        """
+        return self.extract_features(obs, self.features_extractor)
+
+    @abstractmethod
+    def expectation(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: of the head, (B, N, A), or those of one action, (B, N)
+        :return: Q values, (B, A), or (B,)
+        """
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        outputs = self.head(self.features(observation), noisy=not deterministic)
+        return self.expectation(outputs).argmax(dim=1)  # (B,)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **BasePolicy._get_constructor_parameters(self),
+            "features_extractor": self.features_extractor,
+            "features_dim": self.features_dim,
+            "net_arch": self.net_arch,
+            "activation_fn": self.activation_fn,
+            "n_atoms": self.n_atoms,
+            "dueling": self.dueling,
+            "sigma_init": self.sigma_init,
+        }
