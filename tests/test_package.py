@@ -1,6 +1,7 @@
 """What a user gets beside the code: hyperparameter files, examples, the README, the linter's picture of the house."""
 
 import ast
+import inspect
 import pathlib
 import re
 import subprocess
@@ -12,7 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import sb3_eqr
-from sb3_eqr import EqRQRDQN, load_configuration
+from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
+from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.envs import make_atari100k_env
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -54,6 +56,17 @@ def test_public_names_and_docstrings():
     for name in sb3_eqr.__all__:
         assert getattr(sb3_eqr, name).__doc__
     assert re.fullmatch(r"\d+\.\d+\.\d+", sb3_eqr.__version__)
+
+
+@pytest.mark.parametrize("algorithm", [EqRQRDQN, EqRRainbow])
+def test_every_argument_is_explained(algorithm):
+    """In help(): the arguments of the agent and of its policy, each once."""
+    policy = algorithm.policy_aliases["MlpPolicy"]
+    for callables in ([algorithm.__init__], [policy.__init__, EqRPolicy.__init__]):
+        text = "".join((function.__doc__ or "") for function in callables) + "".join(c.__doc__ for c in (policy, EqRPolicy))
+        names = {name for function in callables for name in inspect.signature(function).parameters}
+        for name in names - {"self", "kwargs"}:
+            assert f":param {name}:" in text, name
 
 
 def test_readme_example_runs(tmp_path, monkeypatch):

@@ -214,8 +214,7 @@ def test_beta_may_fall(make):
 # ---------------------------------------------------------------------------------------------- resets
 
 
-@pytest.mark.parametrize("shared_projection", [True, False])
-@pytest.mark.parametrize("alpha", [0.5, 0.2, 0.0, 1.0])
+@pytest.mark.parametrize("alpha, shared_projection", [(0.5, True), (0.2, False), (0.0, True), (1.0, True)])
 def test_a_reset_to_the_last_bit(make, alpha, shared_projection):
     network = {"shared_projection": shared_projection}
     model = make(ChainEnv(), reset_interval=60, reset_shrink_factor=alpha, tau=0.1, policy_kwargs=network).learn(70)
