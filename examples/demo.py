@@ -142,6 +142,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
+    if args.width_scale is not None and args.config != "eqr_bbf":
+        parser.error(f"--width-scale: expected --config eqr_bbf, whose networks have a width, found {args.config}")
     game = atari_env_id(args.game)[4:-3]
     out = args.out or pathlib.Path("demo_results") / (game if args.config == "eqr_qrdqn" else f"{game}-{args.config}")
     settings: dict = {}

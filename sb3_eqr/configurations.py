@@ -29,11 +29,11 @@ def load_configuration(name: str, env_id: str = "atari") -> dict[str, Any]:
     try:
         import yaml
     except ImportError as error:
-        raise ImportError("load_configuration needs PyYAML: pip install 'sb3-eqr[zoo]'") from error
+        raise ImportError("load_configuration needs PyYAML: pip install pyyaml") from error
     files = configuration_files()
     if name not in files:
         raise ValueError(f"configuration: expected one of {list(files)}, found {name!r}")
-    entries = yaml.safe_load(files[name].read_text())
+    entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
         raise ValueError(f"configuration {name!r}: expected an entry of {list(entries)}, found {env_id!r}")
     return {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}

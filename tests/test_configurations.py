@@ -126,8 +126,10 @@ def test_eqr_bbf_is_the_recipe():
     head = model.policy.online.head
     assert head.value is not None and head.advantage[0].out_features == 2048 and head.n_atoms == 51
     assert (model.policy.v_min, model.policy.v_max) == (-10, 10)
-    rates = [model.exploration_schedule(1 - step / 100_000) for step in (0, 2_001, 50_000)]
-    assert rates == pytest.approx([1, 0, 0], abs=1e-12)
+    # 1 where the random steps end, 0 after 2,001 more
+    rates = [model.exploration_schedule(1 - step / 100_000) for step in (2_000, 3_000, 4_001, 50_000)]
+    assert rates == pytest.approx([1, 1001 / 2001, 0, 0], abs=1e-4) and model.learning_starts == 2_000
+    assert all(model.exploration_schedule(1 - step / 100_000) >= 1 for step in range(2_000))
     optimizer = model.policy.optimizer
     assert isinstance(optimizer, th.optim.AdamW) and optimizer.defaults["eps"] == 1.5e-4 and model.learning_rate == 1e-4
     decays = {p.ndim: group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}

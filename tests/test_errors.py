@@ -233,14 +233,42 @@ def test_supports_that_are_none(support, message):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=support)
 
 
-def test_returns_that_the_support_cannot_hold_are_warned_of_once():
-    """CartPole pays 1 a step: 10 of them, discounted by 0.99, are 9.56, and 11 are 10.47."""
-    kwargs = {"learning_starts": 1_000, "seed": 0}
-    with pytest.warns(UserWarning, match=r"step 11: an episode's discounted return is 10.47, .*= \[-10.0, 10.0\]") as caught:
-        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs).learn(60)
-    assert sum("discounted return" in str(warning.message) for warning in caught) == 1
+class ScriptedRewards(ChainEnv):
+    def __init__(self, rewards):
+        super().__init__()
+        self.rewards = rewards
+
+    def step(self, action):
+        self.time += 1
+        return self.observe() * 0, self.rewards[self.time - 1], self.time == len(self.rewards), False, {}
+
+
+@pytest.mark.parametrize(
+    "rewards, step, value",
+    [
+        ([0.5, -25.0, 0.0], 2, "-25"),  # one reward is enough
+        ([0.0] * 60 + [8.0, 8.0], 62, "15.92"),  # late in the episode, far from its start: 8 + 0.99 * 8
+        ([1.0] * 11, 11, "10.47"),  # (1 - 0.99^11) / 0.01
+        ([9.0, 5.0, -4.0, -5.0], None, None),  # 13.95 on the way, but no state's return: 5.23, -3.81, -8.95, -5
+        ([1.0] * 10, None, None),  # 9.56
+    ],
+)
+def test_returns_that_the_support_cannot_hold_are_warned_of_once(rewards, step, value):
+    model = EqRRainbow("MlpPolicy", make_vec_env(lambda: ScriptedRewards(rewards)), learning_starts=1_000, device="cpu")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(3 * len(rewards))
+    found = [str(warning.message) for warning in caught if "discounted return" in str(warning.message)]
+    if step is None:
+        assert found == []
+    else:
+        assert len(found) == 1 and f"step {step}: a discounted return of {value} was seen" in found[0]
+
+
+def test_a_support_that_holds_the_returns_is_not_warned_of():
+    kwargs = {"learning_starts": 100, "seed": 0}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(60)
+        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(90)
         scaled = VecNormalize(make_vec_env(lambda: gym.make("CartPole-v1"), 2), norm_reward=True)
-        EqRRainbow("MlpPolicy", scaled, **{**kwargs, "learning_starts": 100}).learn(200)
+        EqRRainbow("MlpPolicy", scaled, **kwargs).learn(200)

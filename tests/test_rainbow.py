@@ -9,10 +9,13 @@ import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
+from sb3_eqr import EqRRainbow
 from sb3_eqr.common.features_extractor import ConvExtractor, ImpalaExtractor
 from sb3_eqr.common.layers import ImpalaTrunk, NoisyLinear, rescaled
 from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
+from sb3_eqr.common.update_monitor import UpdateMonitor
+from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
 from tests.models import MAKERS
 from tests.toys import ChainEnv, ImageEnv
 
@@ -262,37 +265,113 @@ def test_when_resets_happen(make):
     assert make(ChainEnv(), reset_interval=30, reset_fraction=0.0).learn(100)._resets == []
 
 
+def wait_for_a_longer_window(make):
+    """After 4 updates n is to jump from 2 to 60 by a reset, while the buffer has some 45 transitions."""
+    model = make(ChainEnv(), reset_interval=4, n_steps=2, annealing_steps=1).learn(42)
+    assert model._n_updates == 4
+    model.initial_n_steps = 60
+    return model
+
+
 def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
-    """n jumps from 2 to 60 at the reset, and the buffer has 42 transitions."""
-    model = make(ChainEnv(), reset_interval=4, initial_n_steps=60, n_steps=2, annealing_steps=1, learning_starts=40)
-    model._resets.append(-1)  # annealed long ago
-    model.learn(50)
-    assert model._n_updates == 4 and model._resets == [-1, 4]
-    model.learn(20, reset_num_timesteps=False)
+    model = wait_for_a_longer_window(make)
+    model.learn(8, reset_num_timesteps=False)
+    assert model._n_updates == 4 and model._resets == [4]
+    model.learn(30, reset_num_timesteps=False)
     assert model._n_updates > 4
 
 
-def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make):
+def test_rounds_without_updates_keep_the_last_sound_model(make):
+    """The last update before the reset has spoilt the model, which only the first update after it can tell."""
+    model = wait_for_a_longer_window(make)
+    with th.no_grad():
+        next(model.policy.online.features_extractor.parameters()).fill_(float("nan"))
+    model.learn(8, reset_num_timesteps=False)
+    assert model._resets == [4]
+    with pytest.raises(FloatingPointError, match="put back to update 2 "):
+        model.learn(40, reset_num_timesteps=False)
+    assert all(th.isfinite(p).all() for p in model.policy.parameters()) and model._resets == []
+
+
+def test_resets_are_postponed_not_lost():
+    """Within the last tenth of one call of learn; the next call makes up for it."""
+    model = make_rainbow(ChainEnv(), reset_interval=110).learn(100)
+    assert (model._n_updates, model._resets) == (120, [])
+    model.learn(100, reset_num_timesteps=False)
+    assert model._resets == [120, 230]
+
+
+def test_what_is_frozen_is_not_perturbed():
+    model = make_rainbow(ChainEnv(), reset_interval=30, policy_kwargs={"net_arch": [32, 32]})
+    frozen = [*model.q_net.features_extractor.parameters(), *model.q_net.head.value[0].parameters()]
+    for parameter in frozen:
+        parameter.requires_grad_(False)
+    before = [parameter.clone() for parameter in frozen]
+    model.learn(80)
+    assert len(model._resets) > 0 and all(th.equal(a, b) for a, b in zip(before, frozen, strict=True))
+
+
+class PolicyWithAnArgument(EqRRainbowPolicy):
+    def __init__(self, *args, head_scale=1.0, **kwargs):
+        self.head_scale = head_scale
+        super().__init__(*args, **kwargs)
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        with th.no_grad():
+            for parameter in self.q_net.head.parameters():
+                parameter.mul_(self.head_scale)
+
+
+def test_a_policy_of_ones_own_is_drawn_with_its_arguments():
+    model = EqRRainbow(PolicyWithAnArgument, ChainEnv(), buffer_size=100, policy_kwargs={"head_scale": 0.0})
+    model.set_logger(configure(None, []))
+    model._reset()
+    assert all((parameter == 0).all() for parameter in model.q_net.head.parameters())
+
+
+def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch):
+    """The second update of the round in which the reset was made: back to its start, before the reset."""
     model = make(ChainEnv(), reset_interval=40).learn(60)
     assert model._n_updates == 40 and model._resets == []
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    slots = {id(p): {k: v.clone() for k, v in state.items()} for p, state in model.policy.optimizer.state.items()}
+    moments = {(p, k): v.clone() for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
     model._current_progress_remaining = 0.5
-    model.replay_buffer.rewards[:] = 1e38
+    update = model._update
+
+    def poisoned(samples):
+        update(samples)
+        model.replay_buffer.rewards[:] = 1e38
+
+    monkeypatch.setattr(model, "_update", poisoned)
     model.train(gradient_steps=2, batch_size=8)
     assert model._resets == [40]
-    with pytest.raises(FloatingPointError, match="put back to update"):
+    with pytest.raises(FloatingPointError, match=r"update 42: .*put back to update 40 "):
         model.dump_logs()
-    assert model._resets == [] and model._n_updates <= 40
+    assert model._resets == [] and model._n_updates == 40
+    assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
+    found = {(p, k): v for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
+    assert found.keys() == moments.keys() and all(th.equal(found[key], moments[key]) for key in found)
+    monkeypatch.undo()
     model.replay_buffer.rewards[:] = 0.0
-    if model._n_updates == 40:
-        assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
-        found = model.policy.optimizer.state
-        assert len(found) == len(slots)
-        assert all(th.equal(found[p][k], slots[id(p)][k]) for p in found for k in found[p])
     model.train(gradient_steps=2, batch_size=8)
     model.dump_logs()
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert model._resets == [40] and all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
+    layer = th.nn.Linear(2, 2)
+    optimizer = th.optim.Adam(layer.parameters())
+    layer(th.ones(1, 2)).sum().backward()
+    optimizer.step()
+    monitor = UpdateMonitor(layer, optimizer)
+    monitor.start_round(1)
+    before = optimizer.state[layer.weight]["exp_avg"].clone()
+    optimizer.state.clear()
+    monitor.add({"loss": th.tensor(float("nan"))})
+    with pytest.raises(FloatingPointError):
+        monitor.collect()
+    assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2
 
 
 # ---------------------------------------------------------------------------------------------- optimiser, trunk
@@ -311,8 +390,8 @@ def test_weight_decay_reaches_matrices_only(make, name):
             p.fill_(1.0)
     optimizer.step()
     assert {p.ndim for p in model._trained} == {1, 2}
-    for p in model._trained:
-        assert (p == (0.75 if p.ndim == 2 else 1.0)).all()
+    for key, p in [*model.policy.online.named_parameters(), *model.policy.latent_model.named_parameters()]:
+        assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # noise would die out
     trained = {id(p) for group in optimizer.param_groups for p in group["params"]}
     assert trained == {id(p) for p in [*model.policy.online.parameters(), *model.policy.latent_model.parameters()]}
     model.set_logger(configure(None, []))

@@ -185,6 +185,18 @@ class TinyExtractor(BaseFeaturesExtractor):
         return self.net(obs)
 
 
+class OwnConvolutions(ConvExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space, layers=[[8, 8, 4]])
+
+
+@pytest.mark.parametrize("group", ["SE(2)", None])
+def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
+    network = {"features_extractor_class": OwnConvolutions, "group": group}
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, get_coef=0.0)
+    assert model.predict(model.get_env().reset())[0].shape == (1,)
+
+
 def test_a_custom_extractor_becomes_the_trunk(make):
     kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(60)

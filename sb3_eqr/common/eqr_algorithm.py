@@ -88,8 +88,7 @@ class EqRAlgorithm(EqRSetup):
 
     def _set_window(self, buffer: SequenceReplayBuffer) -> None:
         """n, γ and M as they are now: a schedule or a callback may have moved them."""
-        last_reset = self._resets[-1] if self._resets else 0
-        progress = min((self._n_updates - last_reset) / self.annealing_steps, 1.0)
+        progress = min(self._updates_since_reset / self.annealing_steps, 1.0)
         buffer.n_steps = anneal_n_steps(self.initial_n_steps, self.n_steps, progress)
         buffer.gamma = anneal_gamma(self.initial_gamma, self.gamma, progress)
         buffer.prediction_depth = self.depth
@@ -97,14 +96,16 @@ class EqRAlgorithm(EqRSetup):
             if getattr(self, f"initial_{name}") is not None:
                 self.logger.record(f"train/{name}", getattr(buffer, name))
 
+    @property
+    def _updates_since_reset(self) -> int:
+        return self._n_updates - (self._resets[-1] if self._resets else 0)
+
     def _reset_is_due(self) -> bool:
-        if self.reset_interval is None or self._n_updates == 0 or self._n_updates % self.reset_interval != 0:
-            return False
         over = 1.0 - self._current_progress_remaining >= self.reset_fraction
-        return not over and self._resets[-1:] != [self._n_updates]
+        return self.reset_interval is not None and self._updates_since_reset >= self.reset_interval and not over
 
     def _reset(self) -> None:
-        self.policy.reset_parameters(self.reset_shrink_factor)
+        self.policy.reset_parameters(self._make_policy(), self.reset_shrink_factor)
         self._target_is_copy = True
         self._resets.append(self._n_updates)
         self.logger.record("train/n_resets", len(self._resets))

@@ -122,8 +122,8 @@ class EqRArguments(SafeFiles):
             and perturbed, and the optimiser forgets (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802, and SR-SPR,
             D'Oro et al. 2023, https://openreview.net/forum?id=OpC-9aBBVJe); 40,000 in BBF. ``None``: never
         :param reset_shrink_factor: α in [0, 1]: at a reset, encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF
-        :param reset_fraction: fraction of the entire training period after which there are no resets any more, so that
-            the final agent has had time to recover
+        :param reset_fraction: fraction of the entire training period (as SB3 counts it for each call of ``learn``) after
+            which there are no resets any more, so that the final agent has had time to recover
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation

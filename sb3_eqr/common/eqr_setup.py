@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.checks import check_finite
 from sb3_eqr.common.eqr_arguments import EqRArguments
+from sb3_eqr.common.policies import EqRPolicy
 
 # What of the replay buffer is set by an argument of the algorithm, which may move it later.
 BUFFER_ARGUMENTS = {
@@ -66,7 +67,7 @@ class EqRSetup(EqRArguments):
             "n_steps": 1,
             "replay_buffer_class": buffer_class,
             "target_update_interval": self.target_update_interval or self.n_envs,
-            "policy_kwargs": {**self.policy_kwargs, "reward_loss": self.reward_loss},
+            "policy_kwargs": self._all_policy_kwargs,
         }
         true = {name: getattr(self, name) for name in shown}
         self.__dict__.update(shown)
@@ -88,6 +89,15 @@ class EqRSetup(EqRArguments):
                 "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
                 "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
             )
+
+    @property
+    def _all_policy_kwargs(self) -> dict[str, Any]:
+        return {**self.policy_kwargs, "reward_loss": self.reward_loss}
+
+    def _make_policy(self) -> EqRPolicy:
+        """A policy as :meth:`_setup_model` builds it, freshly drawn."""
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self._all_policy_kwargs)
+        return policy.to(self.device)
 
     def _check_policy_and_spaces(self) -> None:
         base = self.policy_aliases["MlpPolicy"]

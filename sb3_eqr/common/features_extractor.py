@@ -173,7 +173,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         self._description = f"{made}^{n_blocks}, {parameterization}"
         trunk_kwargs = dict(trunk_kwargs or {})
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
-        if issubclass(found, ImageExtractor) or (trunk_class is None and found is not FlattenExtractor):
+        is_default = trunk_class is None and found is not FlattenExtractor
+        if is_default or (normalized_image and issubclass(found, ImageExtractor)):
             trunk_kwargs.setdefault("normalized_image", normalized_image)
         self.trunk = found(observation_space, **trunk_kwargs)
         self.to_algebra = nn.Linear(self.trunk.features_dim, n_blocks * made.num_params)

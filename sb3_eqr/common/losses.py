@@ -51,7 +51,7 @@ def categorical_projection(values: th.Tensor, probabilities: th.Tensor, v_min: f
     positions = ((values - v_min) * ((n_atoms - 1) / (v_max - v_min))).clamp(0, n_atoms - 1)  # (B, N)
     atoms = th.arange(n_atoms, device=values.device, dtype=values.dtype)  # (N,)
     shares = (1 - (positions[:, :, None] - atoms).abs()).clamp(min=0)  # (B, N, N): of each value, to each atom
-    return (probabilities[:, None, :] @ shares).squeeze(1)
+    return (probabilities[:, :, None] * shares).sum(dim=1)  # no matrix product: it may be of lower precision on GPU
 
 
 def categorical_loss(logits: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

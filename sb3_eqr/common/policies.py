@@ -15,6 +15,7 @@ from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import DEFAULT_GROUP, GroupFeaturesExtractor, ImageExtractor, find_trunk
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
+from sb3_eqr.common.layers import NoisyLinear
 from sb3_eqr.common.networks import EqRNetwork
 from sb3_eqr.common.type_aliases import PyTorchObs
 
@@ -44,7 +45,7 @@ class EqRPolicy(BasePolicy):
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate. ``weight_decay`` reaches matrices only,
-        not biases and batch-norm parameters (as in BBF, https://arxiv.org/abs/2305.19452)
+        not biases, batch-norm parameters and the noise of noisy layers (as in BBF, https://arxiv.org/abs/2305.19452)
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
@@ -121,7 +122,7 @@ class EqRPolicy(BasePolicy):
 
     @property
     def online(self) -> EqRNetwork:
-        """The network that acts and is trained."""
+        """The network that is trained, and acts unless ``act_with_target``."""
         raise AttributeError(f"{type(self).__name__} must define `online`")
 
     @property
@@ -184,7 +185,7 @@ class EqRPolicy(BasePolicy):
             parameters += self.own_projection.parameters()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.add_param_group({"params": parameters})
-        _decay_matrices_only(self.optimizer)
+        _decay_matrices_only(self)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
         return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)
@@ -210,26 +211,29 @@ class EqRPolicy(BasePolicy):
             # Running statistics are copied, see https://github.com/DLR-RM/stable-baselines3/issues/996
             polyak_update(get_parameters_by_name(online, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
 
-    def reset_parameters(self, shrink_factor: float) -> None:
+    def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """
         Against lost plasticity: the Q head (and the AET loss's own projection) is drawn afresh (Nikishin et al. 2022,
         https://arxiv.org/abs/2205.07802); encoder and latent model become α old + (1 - α) fresh (shrink and perturb, Ash
         and Adams 2020, https://arxiv.org/abs/1910.08475; for the encoder in SR-SPR and BBF). Batch statistics stay. The
-        optimiser forgets its state, and the target copy becomes one of the new parameters.
+        optimiser forgets its state, and the target copy becomes one of the new parameters. What is frozen stays.
 
+        :param fresh: a policy of the same kind, just built
         :param shrink_factor: α in [0, 1]
         """
-        fresh = type(self)(**self._get_constructor_parameters()).to(self.device)
+        parts: list[tuple[nn.Module | None, nn.Module | None, float]] = [
+            (self.online.features_extractor, fresh.online.features_extractor, shrink_factor),
+            (self.latent_model, fresh.latent_model, shrink_factor),
+            (self.online.head, fresh.online.head, 0.0),
+            (self.own_projection, fresh.own_projection, 0.0),
+        ]
         with th.no_grad():
-            for old, new in (
-                (self.online.features_extractor, fresh.online.features_extractor),
-                (self.latent_model, fresh.latent_model),
-            ):
+            for old, new, alpha in parts:
+                if old is None or new is None:
+                    continue
                 for parameter, drawn in zip(old.parameters(), new.parameters(), strict=True):
-                    parameter.copy_(shrink_factor * parameter + (1 - shrink_factor) * drawn)
-            self.online.head.load_state_dict(fresh.online.head.state_dict())
-            if self.own_projection is not None and fresh.own_projection is not None:
-                self.own_projection.load_state_dict(fresh.own_projection.state_dict())
+                    if parameter.requires_grad:
+                        parameter.copy_(alpha * parameter + (1 - alpha) * drawn if alpha > 0 else drawn)
         self.optimizer.state.clear()
         self.update_target(1.0)
 
@@ -281,12 +285,16 @@ def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.O
     return found
 
 
-def _decay_matrices_only(optimizer: th.optim.Optimizer) -> None:
-    for group in list(optimizer.param_groups):
+def _decay_matrices_only(policy: EqRPolicy) -> None:
+    """Biases, batch-norm parameters and the noise of noisy layers, which would die out, are spared."""
+    noise = {id(module.weight_sigma) for module in policy.modules() if isinstance(module, NoisyLinear)}
+    for group in list(policy.optimizer.param_groups):
         if group.get("weight_decay"):
-            vectors = [parameter for parameter in group["params"] if parameter.ndim < 2]
-            group["params"] = [parameter for parameter in group["params"] if parameter.ndim >= 2]
-            optimizer.add_param_group({**group, "params": vectors, "weight_decay": 0.0})
+            spared = [parameter for parameter in group["params"] if parameter.ndim < 2 or id(parameter) in noise]
+            group["params"] = [
+                parameter for parameter in group["params"] if parameter.ndim >= 2 and id(parameter) not in noise
+            ]
+            policy.optimizer.add_param_group({**group, "params": spared, "weight_decay": 0.0})
 
 
 def _frozen_copy(module: Module) -> Module:

@@ -45,6 +45,7 @@ class UpdateMonitor:
         self._optimizer = optimizer
         self._names: list[str] = []
         self._pending: list[th.Tensor] = []  # (len(names),) each
+        self._has_updates = False
         self._start: Backup | None = None  # of the last round
         self._sound_start: Backup | None = None  # of the round before: its figures are known to be finite
 
@@ -55,7 +56,10 @@ class UpdateMonitor:
         :param n_updates: updates done so far
         """
         model, state = self._model_tensors(), self._optimizer_tensors()
-        old, self._sound_start = self._sound_start, self._start
+        old = self._start
+        if self._has_updates:  # a round without updates says nothing about the one before
+            old, self._sound_start = self._sound_start, self._start
+        self._has_updates = False
         if old is None or old.optimizer.keys() != state.keys():  # the first rounds: make room
             kept = [tensor.clone() for tensor in model], {key: tensor.clone() for key, tensor in state.items()}
         else:
@@ -67,6 +71,7 @@ class UpdateMonitor:
         """
         :param figures: of one update, scalars; the names are the same for all updates of a round
         """
+        self._has_updates = True
         self._names = list(figures)
         self._pending.append(th.stack(list(figures.values())))
 

@@ -1,4 +1,5 @@
 import warnings
+from itertools import accumulate
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,8 +41,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     _warned_of_returns = False
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        # Discounted return of each environment's episode so far, and γ to its length.
-        self._returns, self._powers = np.zeros(self.n_envs), np.ones(self.n_envs)
+        self._episode_rewards: list[list[float]] = [[] for _ in range(self.n_envs)]  # so far
         return super()._setup_learn(*args, **kwargs)
 
     def _store_transition(
@@ -60,24 +60,26 @@ class EqRRainbow(EqRAlgorithm, DQN):
 
     def _watch_returns(self, reward: np.ndarray, dones: np.ndarray) -> None:
         """
-        Warn, once, of a return that the support cannot hold.
+        Warn, once, of a reward or of the discounted rewards to the end of an episode that the support cannot hold.
 
         :param reward: as the agent learns from it, (n_envs,)
         :param dones: (n_envs,)
         """
+        returns = list(reward)
+        for rewards, now, done in zip(self._episode_rewards, reward, dones, strict=True):
+            rewards.append(float(now))
+            if done:
+                returns += accumulate(reversed(rewards), lambda later, r: r + self.gamma * later)
+                rewards.clear()
         v_min, v_max = self.policy.v_min, self.policy.v_max
-        self._returns += self._powers * reward
-        beyond = (self._returns < v_min) | (self._returns > v_max)
-        if beyond.any():
+        worst = max(returns, key=lambda value: max(v_min - value, value - v_max))
+        if not v_min <= worst <= v_max:
             self._warned_of_returns = True
             warnings.warn(
-                f"step {self.num_timesteps}: an episode's discounted return is {self._returns[beyond][0]:.4g}, but the agent's"
-                f" return distribution ends at [v_min, v_max] = [{v_min}, {v_max}]: it cannot tell such returns apart. "
+                f"step {self.num_timesteps}: a discounted return of {worst:.4g} was seen, but the agent's return distribution "
+                f"ends at [v_min, v_max] = [{v_min}, {v_max}]: it cannot tell such returns apart. "
                 "Pass policy_kwargs=dict(v_min=..., v_max=...) that hold them, or scale the rewards (VecNormalize)."
             )
-        self._powers *= self.gamma
-        self._returns[dones] = 0.0
-        self._powers[dones] = 1.0
 
     def _td_loss(
         self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
@@ -89,4 +91,4 @@ class EqRRainbow(EqRAlgorithm, DQN):
         return categorical_loss(current, target)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_returns", "_powers", "_warned_of_returns"]
+        return [*super()._excluded_save_params(), "_episode_rewards", "_warned_of_returns"]

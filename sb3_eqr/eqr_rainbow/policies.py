@@ -49,7 +49,8 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         return self.head(self.features(obs), noisy).log_softmax(dim=1)
 
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
-        return th.einsum("bn...,n->b...", outputs.softmax(dim=1), self.support)
+        support = self.support.view(-1, *[1] * (outputs.ndim - 2))  # (N, 1) or (N,)
+        return (outputs.softmax(dim=1) * support).sum(dim=1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "v_min": self.v_min, "v_max": self.v_max}
