@@ -97,6 +97,7 @@ class EqRSetup(EqRArguments):
     def _make_policy(self) -> EqRPolicy:
         """A policy as :meth:`_setup_model` builds it, freshly drawn."""
         policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self._all_policy_kwargs)
+        assert isinstance(policy, EqRPolicy)
         return policy.to(self.device)
 
     def _check_policy_and_spaces(self) -> None:
