@@ -143,6 +143,12 @@ def test_eqr_bbf_is_the_recipe():
     assert model.policy.act_with_target and model.double_q
 
 
+@pytest.mark.parametrize("path", configuration_files().values(), ids=lambda path: path.stem)
+def test_files_are_plain_ascii(path):
+    """RL Zoo opens them in the encoding of the machine."""
+    assert path.read_bytes().isascii()
+
+
 def test_unknown_names_are_told():
     with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
         load_configuration("bbf")
