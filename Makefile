@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 GAME ?= Pong
 CONFIG ?= eqr_qrdqn
+ARGS ?=
 STEPS ?=
 
 .PHONY: demo test pytest format lint type commit-checks clean
@@ -14,7 +15,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: $(VENV)/installed
-	$(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(if $(STEPS),--steps $(STEPS))
+	$(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
 
 test: lint type pytest
 

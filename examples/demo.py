@@ -38,6 +38,7 @@ LOSSES = {
 }
 EVALUATION_SECONDS = 60  # kept free at the end of the minutes
 CHECKPOINT_STEPS = 10_000
+FULL_STEPS = 100_000  # what the configurations are for
 SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Table 5's 2,000 would be most of it
 
 
@@ -66,11 +67,10 @@ def make_model(config: str, width_scale: float | None, game: str, seed: int, **c
     :param config: a file in zoo_hyperparams
     :param width_scale: of an "impala" trunk; its head is 512 times as wide, as BBF's is
     """
-    settings = {**load_configuration(config), **changes}
     if width_scale is not None:
-        network = settings["policy_kwargs"]
-        network["features_extractor_kwargs"]["width_scale"] = width_scale
-        network["net_arch"] = [round(512 * width_scale)]
+        network = {"features_extractor_kwargs": {"width_scale": width_scale}, "net_arch": [round(512 * width_scale)]}
+        changes["policy_kwargs"] = network
+    settings = load_configuration(config, **changes)
     algorithm = EqRQRDQN if config == "eqr_qrdqn" else EqRRainbow
     return algorithm("CnnPolicy", make_atari100k_env(game, seed=seed), seed=seed, **settings)
 
@@ -132,15 +132,21 @@ def draw(
 
 def main() -> None:
     """Train, evaluate, save, draw."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
-    parser.add_argument("--game", default="Pong")
-    parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn")
-    parser.add_argument("--width-scale", type=float, help="of eqr_bbf's networks, 4 in the paper")
+    parser = argparse.ArgumentParser(
+        description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--game", default="Pong", help="any of ALE's games")
+    parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn", help="see docs/configurations.md")
+    parser.add_argument(
+        "--width-scale", type=float, help="of eqr_bbf, whose head gets 512 times as wide; 4 in its paper, 1 fits two cores"
+    )
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
-    parser.add_argument("--minutes", type=float, default=5.5)
-    parser.add_argument("--eval-episodes", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=pathlib.Path)
+    parser.add_argument("--minutes", type=float, default=5.5, help="for training and evaluation, where --steps is not given")
+    parser.add_argument("--eval-episodes", type=int, default=3, help="games at the end")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    parser.add_argument(
+        "--out", type=pathlib.Path, help="folder; demo_results/<game> or demo_results/<game>-<config> if not given"
+    )
     args = parser.parse_args()
     if args.width_scale is not None and args.config != "eqr_bbf":
         parser.error(f"--width-scale: expected --config eqr_bbf, whose networks have a width, found {args.config}")
@@ -152,6 +158,8 @@ def main() -> None:
         seconds = args.minutes * 60 - EVALUATION_SECONDS
         args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}
+    elif "exploration_fraction" in (config := load_configuration(args.config)):
+        settings = {"exploration_fraction": config["exploration_fraction"] * FULL_STEPS / args.steps}  # the same steps
     print(f"{args.config} on {args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
 
     model = make_model(args.config, args.width_scale, args.game, args.seed, **settings)
@@ -162,6 +170,8 @@ def main() -> None:
         callbacks.append(CheckpointCallback(CHECKPOINT_STEPS, str(out / "checkpoints"), save_replay_buffer=True))
     (out / "training.png").unlink(missing_ok=True)  # of a run before
     model.learn(args.steps, callback=callbacks, progress_bar=True)
+    if model._n_updates == 0:
+        print("No update was made: this configuration is too slow here. Try --width-scale 1 with eqr_bbf, or more --minutes.")
     model.dump_logs()
     model.logger.close()
     model.save(out / "model")

@@ -16,14 +16,17 @@ def configuration_files() -> dict[str, pathlib.Path]:
     return {path.stem: path for path in sorted(folder.rglob("*.yml"))}
 
 
-def load_configuration(name: str, env_id: str = "atari") -> dict[str, Any]:
+def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict[str, Any]:
     """
     Keyword arguments of a named configuration, for the constructor of its agent::
 
         EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf"))
+        narrow = {"net_arch": [512], "features_extractor_kwargs": {"width_scale": 1}}
+        EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf", policy_kwargs=narrow, learning_starts=500))
 
-    :param name: one of :func:`configuration_files`; docs/configurations.md says what each is
+    :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/configurations.md says what each is
     :param env_id: the entry in that file: "atari", or the name of an environment
+    :param changes: arguments that replace those of the file; dictionaries are merged into its dictionaries
     :raises ValueError: if there is no such file or entry
     """
     try:
@@ -36,4 +39,12 @@ def load_configuration(name: str, env_id: str = "atari") -> dict[str, Any]:
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
         raise ValueError(f"configuration {name!r}: expected an entry of {list(entries)}, found {env_id!r}")
-    return {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}
+    return _merged({key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}, changes)
+
+
+def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    result = {**old, **new}
+    for key in old.keys() & new.keys():
+        if isinstance(old[key], dict) and isinstance(new[key], dict):
+            result[key] = _merged(old[key], new[key])
+    return result

@@ -149,6 +149,15 @@ def test_files_are_plain_ascii(path):
     assert path.read_bytes().isascii()
 
 
+def test_changes_are_merged():
+    plain = load_configuration("eqr_bbf")
+    changed = load_configuration("eqr_bbf", learning_starts=5, policy_kwargs={"features_extractor_kwargs": {"width_scale": 1}})
+    assert changed.pop("learning_starts") == 5
+    assert changed["policy_kwargs"]["features_extractor_kwargs"] == {"width_scale": 1, "rescale": True}
+    changed["policy_kwargs"]["features_extractor_kwargs"]["width_scale"] = 4
+    assert changed == plain
+
+
 def test_unknown_names_are_told():
     with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
         load_configuration("bbf")

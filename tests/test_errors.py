@@ -222,7 +222,7 @@ def test_numbers_of_atoms(algorithm, name):
     [
         ({"v_min": 10.0}, "v_min: expected a number below v_max = 10.0, found 10.0"),
         ({"v_min": 3, "v_max": 1}, "v_min: expected a number below v_max = 1, found 3"),
-        ({"v_max": float("inf")}, "v_max: expected a finite number"),
+        ({"v_max": float("inf")}, "v_max: expected a finite number, found inf"),
         ({"v_min": "low"}, "v_min: expected a finite number"),
         ({"n_atoms": 1}, "n_atoms: expected a whole number of at least 2"),
     ],
@@ -231,6 +231,12 @@ def test_numbers_of_atoms(algorithm, name):
 def test_supports_that_are_none(support, message):
     with pytest.raises(ValueError, match=message):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=support)
+
+
+def test_policy_kwargs_that_there_are_not(make):
+    other = "n_atoms" if make.n_atoms_name == "n_quantiles" else "n_quantiles"
+    with pytest.raises(TypeError, match=f"takes no {other}. It takes act_with_target, .*{make.n_atoms_name}.*sigma_init"):
+        make(ChainEnv(), policy_kwargs={other: 5})
 
 
 class ScriptedRewards(ChainEnv):

@@ -106,6 +106,9 @@ def test_the_callers_dictionaries_are_left_alone(make):
     model.learn(60)
     assert policy_kwargs == {"net_arch": [16]} and buffer_kwargs == {"handle_timeout_termination": False}
     assert model.policy.optimizer.defaults["eps"] == 1.5e-4  # Table 5
+    for name, expected in (("AdamW", 1.5e-4), (th.optim.Adam, 1.5e-4), ("RAdam", 1e-8)):  # RAdam: torch's own
+        named = make(ChainEnv(), policy_kwargs={"optimizer_class": name})
+        assert named.policy.optimizer.defaults["eps"] == expected
     own = make(ChainEnv(), policy_kwargs={"optimizer_kwargs": {"betas": (0.5, 0.9)}})
     assert own.policy.optimizer.defaults["betas"] == (0.5, 0.9) and own.policy.optimizer.defaults["eps"] == 1.5e-4
 

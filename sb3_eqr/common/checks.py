@@ -17,8 +17,9 @@ def check_number(name: str, value: Any, low: float, high: float = np.inf, whole:
     kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
     if not isinstance(value, kinds) or not (np.isfinite(value) and low <= value <= high):
         kind = "a whole number" if whole else "a finite number"
-        legal = f"of at least {low}" if high == np.inf else f"in [{low}, {high}]"
-        raise ValueError(f"{name}: expected {kind} {legal}, found {value!r}")
+        legal = f" of at least {low}" if high == np.inf else f" in [{low}, {high}]"
+        legal = "" if (low, high) == (-np.inf, np.inf) else legal
+        raise ValueError(f"{name}: expected {kind}{legal}, found {value!r}")
 
 
 def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:

@@ -84,6 +84,8 @@ class EqRAlgorithm(EqRSetup):
             if not buffer.can_sample():
                 break  # the first window is not complete yet
             self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
+        if self.reset_interval is not None:
+            self.logger.record("train/n_resets", len(self._resets))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _set_window(self, buffer: SequenceReplayBuffer) -> None:
@@ -108,7 +110,6 @@ class EqRAlgorithm(EqRSetup):
         self.policy.reset_parameters(self._make_policy(), self.reset_shrink_factor)
         self._target_is_copy = True
         self._resets.append(self._n_updates)
-        self.logger.record("train/n_resets", len(self._resets))
 
     def _update(self, samples: SequenceReplayBufferSamples) -> None:
         """One gradient step, the target, the priorities."""

@@ -8,7 +8,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.policies import EqRPolicy, find_optimizer
 from sb3_eqr.common.safe_files import SafeFiles
 
 
@@ -98,7 +98,8 @@ class EqRArguments(SafeFiles):
             ``None``: after every gradient step, as the paper asks
         :param exploration_fraction: fraction of entire training period over which the exploration rate is reduced;
             2,000 of 100,000 steps, after which the noisy layers explore
-        :param exploration_initial_eps: initial value of random action probability
+        :param exploration_initial_eps: initial value of random action probability; above 1 the actions are random until the
+            line has come down to 1
         :param exploration_final_eps: final value of random action probability
         :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
         :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
@@ -126,7 +127,8 @@ class EqRArguments(SafeFiles):
             which there are no resets any more, so that the final agent has had time to recover
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
-        :param policy_kwargs: additional arguments to be passed to the policy on creation
+        :param policy_kwargs: additional arguments to be passed to the policy on creation, see
+            :class:`~sb3_eqr.common.policies.EqRPolicy`
         :param verbose: the verbosity level: 0 no output, 1 info, 2 debug
         :param seed: Seed for the pseudo random generators
         :param device: Device (cpu, cuda, ...) on which the code should be run.
@@ -138,8 +140,8 @@ class EqRArguments(SafeFiles):
         del optimize_memory_usage  # kept so that SB3's arguments fit
         # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
         policy_kwargs = dict(policy_kwargs or {})
-        if "optimizer_class" not in policy_kwargs:
-            policy_kwargs["optimizer_class"] = th.optim.Adam
+        policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
+        if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
             policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **(policy_kwargs.get("optimizer_kwargs") or {})}  # Table 5
         super().__init__(  # type: ignore[call-arg]
             policy,

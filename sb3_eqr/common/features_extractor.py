@@ -42,13 +42,14 @@ class ImageExtractor(BaseFeaturesExtractor):
     ):
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
             raise ValueError(
-                f"CnnPolicy: expected uint8 images (channels, height, width) in [0, 255], found {observation_space}. "
-                "Use MlpPolicy for vectors, MultiInputPolicy for dicts, and normalize_images=False for float images."
+                f"image encoder: expected uint8 images (channels, height, width) in [0, 255], found {observation_space}. "
+                "Use MlpPolicy for vectors, MultiInputPolicy for dicts, both without a features_extractor_class for images, "
+                "and normalize_images=False for float images."
             )
         channels, height, width = observation_space.shape
         if min(height, width) < smallest:
             raise ValueError(
-                f"CnnPolicy: expected images of at least {smallest}x{smallest} pixels, found {height}x{width}. "
+                f"image encoder: expected images of at least {smallest}x{smallest} pixels, found {height}x{width}. "
                 "Pass a features_extractor_class with smaller filters."
             )
         trunk = make_trunk(channels)

@@ -1,5 +1,6 @@
 """What every EqR policy adds to an SB3 Q-learning policy."""
 
+import inspect
 from copy import deepcopy
 from typing import Any, ClassVar, TypeVar
 
@@ -41,11 +42,14 @@ class EqRPolicy(BasePolicy):
     :param features_extractor_class: the trunk; the group encoder is put behind it. Its class or its name: "nature" (the
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``). ``None``: SB3's
         ``FlattenExtractor`` (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
-    :param features_extractor_kwargs: its keyword arguments
+    :param features_extractor_kwargs: its keyword arguments. "nature" takes ``layers`` (filters, kernel size and stride of each
+        convolution), "impala" takes ``width_scale`` (multiplies its channels; BBF has 4), both take ``rescale`` (latents of
+        each sample scaled to [0, 1], as in SPR and BBF)
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
-    :param optimizer_kwargs: its keyword arguments, excluding the learning rate. ``weight_decay`` reaches matrices only,
-        not biases, batch-norm parameters and the noise of noisy layers (as in BBF, https://arxiv.org/abs/2305.19452)
+    :param optimizer_kwargs: its keyword arguments, excluding the learning rate. The agent's constructor adds ``eps=1.5e-4``
+        (Table 5) for Adam and AdamW where it is not given. ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452;
+        AdamW's own default is 0.01) reaches matrices only, not biases, batch-norm parameters and the noise of noisy layers
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
@@ -94,6 +98,14 @@ class EqRPolicy(BasePolicy):
         reward_loss: str = "mse",
         **stock_kwargs: Any,
     ):
+        legal = inspect.signature(super().__init__).parameters
+        unknown = [name for name in stock_kwargs if name not in legal]
+        if unknown:
+            own = [inspect.signature(kind.__init__).parameters for kind in (type(self), EqRPolicy)]  # type: ignore[misc]
+            names = sorted({name for parameters in own for name in list(parameters)[4:]} - {"kwargs", "stock_kwargs"})
+            raise TypeError(
+                f"policy_kwargs: {type(self).__name__} takes no {', '.join(unknown)}. It takes {', '.join(names)}."
+            )
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         check_number("sigma_init", sigma_init, 0)
         self.group = group

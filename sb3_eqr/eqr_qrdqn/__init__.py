@@ -1,4 +1,4 @@
 from sb3_eqr.eqr_qrdqn.eqr_qrdqn import EqRQRDQN
-from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, MlpPolicy, MultiInputPolicy
 
-__all__ = ["CnnPolicy", "EqRQRDQN", "MlpPolicy", "MultiInputPolicy"]
+__all__ = ["CnnPolicy", "EqRQRDQN", "EqRQRDQNPolicy", "MlpPolicy", "MultiInputPolicy"]

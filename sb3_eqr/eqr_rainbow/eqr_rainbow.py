@@ -78,7 +78,8 @@ class EqRRainbow(EqRAlgorithm, DQN):
             warnings.warn(
                 f"step {self.num_timesteps}: a discounted return of {worst:.4g} was seen, but the agent's return distribution "
                 f"ends at [v_min, v_max] = [{v_min}, {v_max}]: it cannot tell such returns apart. "
-                "Pass policy_kwargs=dict(v_min=..., v_max=...) that hold them, or scale the rewards (VecNormalize)."
+                "Pass policy_kwargs=dict(v_min=..., v_max=...): a step's least and largest reward over 1 - gamma hold "
+                "them all. Or scale the rewards (VecNormalize)."
             )
 
     def _td_loss(
