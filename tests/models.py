@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import pytest
+
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 
@@ -31,3 +33,6 @@ class Maker:
 
 
 MAKERS = [Maker(EqRQRDQN, "n_quantiles"), Maker(EqRRainbow, "n_atoms")]
+
+# For slow questions that have nothing to do with the head.
+EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRainbow"])

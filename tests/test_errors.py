@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
-from tests.models import SMALL
+from tests.models import EITHER, SMALL
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 
 
@@ -95,6 +95,7 @@ def test_a_frame_stack_that_is_not_one(make):
     assert model.num_timesteps == 1
 
 
+@EITHER
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("where, what", [("obs", "observation"), ("reward", "reward"), ("terminal", "observation")])
@@ -160,6 +161,7 @@ def test_the_very_first_update_may_be_the_bad_one(make):
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
+@EITHER
 @pytest.mark.parametrize("gradient_steps", [1, 2, 3])
 @pytest.mark.parametrize("good_rounds", [0, 1, 4])
 def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, gradient_steps, good_rounds):

@@ -28,7 +28,7 @@ from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
 from sb3_eqr.common.features_extractor import ConvExtractor
-from tests.models import N_ATOMS, SMALL
+from tests.models import EITHER, N_ATOMS, SMALL
 from tests.toys import ChainEnv, ImageEnv
 
 
@@ -44,6 +44,7 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
+@EITHER
 @pytest.mark.parametrize(
     "kwargs",
     [
@@ -234,11 +235,13 @@ def online_network(model):
     return model.quantile_net if isinstance(model, QRDQN) else model.q_net
 
 
+@EITHER
 @pytest.mark.parametrize("env", [lambda: gym.make("FrozenLake-v1"), lambda: gym.make("CliffWalking-v1")])
 def test_discrete_observations(make, env):
     assert make(env()).learn(80)._n_updates > 0
 
 
+@EITHER
 @pytest.mark.parametrize("space", [spaces.MultiDiscrete([4, 3]), spaces.MultiBinary(5)])
 def test_multi_discrete_and_multi_binary_observations(make, space):
     class Env(ChainEnv):
@@ -263,6 +266,7 @@ def test_dict_observations_are_augmented_where_they_are_images(make):
         make(SimpleMultiObsEnv(), "MlpPolicy")
 
 
+@EITHER
 def test_frame_stacks_are_found_and_stored_once(make):
     env = VecFrameStack(make_vec_env(ImageEnv, 2), 4)
     model = make(env, "CnnPolicy", buffer_size=400).learn(100)

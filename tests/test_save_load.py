@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
-from tests.models import MAKERS
+from tests.models import EITHER, MAKERS
 from tests.resume import Save, make_env
 from tests.toys import ChainEnv, ImageEnv
 
@@ -59,6 +59,7 @@ def test_save_and_load_by_file_object(make):
     assert loaded.replay_buffer.size() == 60
 
 
+@EITHER
 def test_checkpoints_made_in_the_middle_of_a_step_go_on(make, tmp_path):
     make(ChainEnv()).learn(120, callback=CheckpointCallback(50, str(tmp_path), save_replay_buffer=True))
     model = make.algorithm.load(tmp_path / "rl_model_100_steps", env=ChainEnv())
@@ -78,6 +79,7 @@ def test_attributes_can_be_left_out_and_put_in(make, tmp_path):
     assert make.algorithm.load(tmp_path / "c").custom == 3
 
 
+@EITHER
 def test_switches_can_be_changed_on_loading(make, tmp_path):
     make(ChainEnv()).save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
