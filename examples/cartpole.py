@@ -2,6 +2,7 @@
 Agents on CartPole-v1, with their learning curves.
 
     python examples/cartpole.py --seeds 0 1 2 3 4                      # EqRQRDQN, 30,000 steps
+    python examples/cartpole.py --agent eqr_rainbow --seeds 0 1 2 3 4  # EqRRainbow with the same settings
     python examples/cartpole.py --agent qrdqn --seeds 0 1 2 3 4        # sb3_contrib's QRDQN with the same settings
     python examples/cartpole.py --agent plain_rainbow --seeds 0 1 2 3 4    # EqRRainbow, every switch off: a categorical DQN
     python examples/cartpole.py --agent dqn --seeds 0 1 2 3 4              # SB3's DQN with the same settings
@@ -67,6 +68,9 @@ def make_model(agent: str, seed: int) -> OffPolicyAlgorithm:
     """
     if agent == "eqr_qrdqn":
         return EqRQRDQN("MlpPolicy", "CartPole-v1", seed=seed, **SETTINGS)
+    if agent == "eqr_rainbow":
+        network = {"net_arch": [256, 256], "noisy": False, "v_min": 0.0, "v_max": 100.0}
+        return EqRRainbow("MlpPolicy", "CartPole-v1", seed=seed, **{**SETTINGS, "policy_kwargs": network})
     if agent == "qrdqn":
         network = {key: value for key, value in SETTINGS["policy_kwargs"].items() if key != "noisy"}
         return QRDQN("MlpPolicy", "CartPole-v1", seed=seed, **{**SETTINGS, "max_grad_norm": 10, "policy_kwargs": network})
@@ -76,7 +80,7 @@ def make_model(agent: str, seed: int) -> OffPolicyAlgorithm:
     return EqRRainbow("MlpPolicy", "CartPole-v1", seed=seed, **DQN_SETTINGS, **OFF, policy_kwargs=network)
 
 
-STEPS_OF = {"eqr_qrdqn": STEPS, "qrdqn": STEPS, "plain_rainbow": 50_000, "dqn": 50_000}
+STEPS_OF = {"eqr_qrdqn": STEPS, "eqr_rainbow": STEPS, "qrdqn": STEPS, "plain_rainbow": 50_000, "dqn": 50_000}
 
 
 def train(agent: str, seed: int, steps: int) -> dict:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.envs import atari, make_atari100k_env
+from sb3_eqr.envs.atari import Atari100kWrapper
 
 
 def games(env):
@@ -124,7 +127,7 @@ def test_the_limit_is_that_of_the_paper():
     env = make_atari100k_env("Pong", n_envs=2, seed=0)
     assert atari.MAX_STEPS * atari.FRAME_SKIP == 108_000 and env.num_envs == 2
     layer = games(env)[0]
-    while not isinstance(layer, gym.wrappers.TimeLimit):
+    while not isinstance(layer, atari.TimeLimit):  # RL Zoo puts another class into gymnasium.wrappers
         layer = layer.env
     assert layer._max_episode_steps == 27_000
     env.reset()
@@ -176,3 +179,29 @@ def test_the_main_job_in_small(tmp_path):
     games(short)[0].env.env.env._max_episode_steps = 40
     mean, _ = evaluate_policy(loaded, short, n_eval_episodes=1)
     assert -21 <= mean <= 21
+
+
+def test_the_wrapper_for_rl_zoo_sees_what_training_sees():
+    """The same random actions: the same observations, clipped rewards and ends, whatever stands between the wrappers."""
+    ours = make_atari100k_env("Breakout", seed=3)
+    zoo = VecFrameStack(make_vec_env("BreakoutNoFrameskip-v4", seed=3, wrapper_class=Atari100kWrapper), 4)
+    rng = np.random.default_rng(0)
+    assert np.array_equal(ours.reset(), zoo.reset())
+    ends = 0
+    for _ in range(400):
+        action = rng.integers(0, 4, 1)
+        a, b = ours.step(action), zoo.step(action)
+        assert np.array_equal(a[0], b[0]) and a[1] == b[1] and a[2] == b[2]
+        ends += int(a[2][0])
+    assert ends > 1
+
+
+def test_the_wrapper_refuses_what_is_another_protocol():
+    with pytest.raises(ValueError, match=r"found .*'repeat_action_probability': 0.25.*NoFrameskip-v4 name"):
+        make_vec_env("ALE/Pong-v5", wrapper_class=Atari100kWrapper)
+    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}
+    assert make_vec_env("ALE/Pong-v5", env_kwargs=kwargs, wrapper_class=Atari100kWrapper).observation_space.shape == (
+        84,
+        84,
+        1,
+    )

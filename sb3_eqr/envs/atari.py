@@ -50,12 +50,10 @@ def make_atari100k_env(
     def make_game() -> gym.Env:
         # Sticky actions, frame skip and frame limit of ALE itself off: the wrappers do what the protocol says.
         env = gym.make(env_id, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None)
-        return TimeLimit(MaxAndSkipEnv(NoopResetEnv(env, noop_max=NOOP_MAX), skip=FRAME_SKIP), MAX_STEPS)
+        return _in_agent_steps(env)
 
     def preprocess(env: gym.Env) -> gym.Env:  # outside Monitor
-        if not training:
-            return WarpFrame(env, width=SCREEN_SIZE, height=SCREEN_SIZE)
-        return ClipRewardEnv(WarpFrame(EpisodicLifeEnv(env), width=SCREEN_SIZE, height=SCREEN_SIZE))
+        return _for_training(env) if training else WarpFrame(env, width=SCREEN_SIZE, height=SCREEN_SIZE)
 
     env = make_vec_env(
         make_game,
@@ -67,6 +65,35 @@ def make_atari100k_env(
         vec_env_kwargs=vec_env_kwargs,
     )
     return VecFrameStack(env, n_stack=FRAME_STACK)
+
+
+class Atari100kWrapper(gym.Wrapper):
+    """
+    The same preprocessing around one ALE environment, in training, for RL Zoo's ``env_wrapper``
+    (with ``frame_stack: 4``). SB3's ``evaluate_policy`` still sees raw scores of whole games, from ``Monitor``.
+
+    :param env: "PongNoFrameskip-v4", or "ALE/Pong-v5" made with ``frameskip=1, repeat_action_probability=0.0``
+    :raises ValueError: for an environment that skips frames or repeats actions itself
+    """
+
+    def __init__(self, env: gym.Env):
+        made_with = {} if env.spec is None else env.spec.kwargs
+        found = {key: made_with.get(key) for key in ("frameskip", "repeat_action_probability")}
+        if found != {"frameskip": 1, "repeat_action_probability": 0.0}:
+            raise ValueError(
+                f"Atari100kWrapper: expected an environment made with frameskip=1 and repeat_action_probability=0.0, found "
+                f"{found}. Use the NoFrameskip-v4 name of the game, or RL Zoo's "
+                "--env-kwargs frameskip:1 repeat_action_probability:0.0."
+            )
+        super().__init__(_for_training(_in_agent_steps(env)))
+
+
+def _in_agent_steps(env: gym.Env) -> gym.Env:
+    return TimeLimit(MaxAndSkipEnv(NoopResetEnv(env, noop_max=NOOP_MAX), skip=FRAME_SKIP), MAX_STEPS)
+
+
+def _for_training(env: gym.Env) -> gym.Env:
+    return ClipRewardEnv(WarpFrame(EpisodicLifeEnv(env), width=SCREEN_SIZE, height=SCREEN_SIZE))
 
 
 def atari_env_id(game: str) -> str:
