@@ -385,12 +385,12 @@ def test_singular_states_of_gl_neither_stop_nor_poison_a_run(make):
     assert (encoder.weight != 0).any()
 
 
+@EITHER
 def test_identity_environment_is_learned(make):
-    n_steps = 3 if make.algorithm is EqRQRDQN else 1
     env = DummyVecEnv([lambda: IdentityEnv(10)])
     model = make(
         env,
-        n_steps=n_steps,
+        n_steps=1,
         gamma=0.4,
         learning_rate=3e-3,
         train_freq=2,
