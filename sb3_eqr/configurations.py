@@ -4,16 +4,18 @@ import pathlib
 from typing import Any
 
 ZOO_KEYS = ("policy", "n_timesteps", "frame_stack", "n_envs", "normalize", "env_wrapper")  # read by RL Zoo itself
+STOCK = "stock"  # the folder of settings for SB3's own agents
 
 
 def configuration_files() -> dict[str, pathlib.Path]:
     """
-    :return: name -> file, of every file in ``zoo_hyperparams``: "eqr_rainbow", "eqr_bbf", "gl2+aet+r", ...
+    :return: name -> file, of every file in ``zoo_hyperparams``: "eqr_rainbow", "eqr_bbf", "gl2+aet+r", ..., "stock/dqn"
     """
     package = pathlib.Path(__file__).parent
     folders = (package / "zoo_hyperparams", package.parent / "zoo_hyperparams")  # in a wheel, in a checkout
     folder = next(folder for folder in folders if folder.is_dir())
-    return {path.stem: path for path in sorted(folder.rglob("*.yml"))}
+    files = sorted(folder.rglob("*.yml"))
+    return {f"{STOCK}/{path.stem}" if path.parent.name == STOCK else path.stem: path for path in files}
 
 
 def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict[str, Any]:

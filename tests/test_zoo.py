@@ -6,9 +6,12 @@ import sys
 import optuna
 import pytest
 import yaml
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import ALGOS
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, zoo
 from sb3_eqr.configurations import configuration_files
+from sb3_eqr.zoo.__main__ import find_hyperparameters, main
 
 
 @pytest.fixture
@@ -17,7 +20,7 @@ def sb3_eqr(monkeypatch, capfd):
 
     def call(line):
         monkeypatch.setattr(sys, "argv", ["sb3-eqr", *line.split()])
-        zoo.main()
+        main()
         return capfd.readouterr().out
 
     return call
@@ -73,8 +76,8 @@ def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):
     (tmp_path / "own.yml").write_text(yaml.dump(own))
     sb3_eqr(f"train --algo eqr_rainbow --env CartPole-v1 --conf-file {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
     assert EqRRainbow.load(tmp_path / "eqr_rainbow" / "CartPole-v1_1" / "CartPole-v1.zip").policy.v_max == 100
-    assert zoo.find_hyperparameters("eqr_rainbow", "eqr_bbf") == str(configuration_files()["eqr_bbf"])
-    assert zoo.find_hyperparameters("qrdqn", None) is None
+    assert find_hyperparameters("eqr_rainbow", "eqr_bbf") == str(configuration_files()["eqr_bbf"])
+    assert find_hyperparameters("qrdqn", None) is None
     sb3_eqr(f"train --algo dqn --env CartPole-v1 -n 60 --eval-freq -1 -f {tmp_path}")
     assert (tmp_path / "dqn" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
 
@@ -87,9 +90,9 @@ def test_the_search_space_makes_agents(name):
     groups = set()
     for _ in range(8):
         trial = study.ask()
-        sampled = zoo.HYPERPARAMS_SAMPLER[name](trial, 2, 1, {})
-        assert zoo.HYPERPARAMS_CONVERTER[name](trial.params) == sampled
-        model = zoo.ALGOS[name]("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu", **sampled)
+        sampled = HYPERPARAMS_SAMPLER[name](trial, 2, 1, {})
+        assert HYPERPARAMS_CONVERTER[name](trial.params) == sampled
+        model = ALGOS[name]("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu", **sampled)
         groups.add(str(model.policy.group))
         assert model.gradient_steps >= 1 and (name == "eqr_qrdqn") != ("v_max" in sampled["policy_kwargs"])
     assert len(groups) > 1

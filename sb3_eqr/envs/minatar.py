@@ -1,0 +1,44 @@
+"""MinAtar (Young and Tian 2019, https://arxiv.org/abs/1903.03176): five small Atari games of 10×10 pixels."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+GAMES = {
+    "Asterix": "asterix",
+    "Breakout": "breakout",
+    "Freeway": "freeway",
+    "Seaquest": "seaquest",
+    "SpaceInvaders": "space_invaders",
+}
+
+
+def register_minatar() -> None:
+    """Register the games under MinAtar's own names: ``MinAtar/<Game>-v0`` has all six actions, ``-v1`` those of use."""
+    for name, game in GAMES.items():
+        for version, minimal in (("v0", False), ("v1", True)):
+            env_id = f"MinAtar/{name}-{version}"
+            if env_id not in gym.registry:
+                kwargs = {"game": game, "use_minimal_action_set": minimal}
+                gym.register(env_id, entry_point="minatar.gym:BaseEnv", kwargs=kwargs)
+
+
+class ChannelsFirstImage(gym.ObservationWrapper):
+    """
+    MinAtar's planes as an image, for ``CnnPolicy``.
+
+    :param env: observations (height, width, channels), bool
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        assert env.observation_space.shape is not None
+        height, width, channels = env.observation_space.shape
+        self.observation_space = spaces.Box(0, 255, (channels, height, width), np.uint8)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """
+        :param observation: (height, width, channels), bool
+        :return: (channels, height, width), uint8: 0 or 255
+        """
+        return np.moveaxis(observation, 2, 0).astype(np.uint8) * np.uint8(255)

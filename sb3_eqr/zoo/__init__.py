@@ -1,0 +1,17 @@
+"""
+RL Zoo with the EqR agents: registration, search spaces, and the command line ``sb3-eqr`` (or ``python -m sb3_eqr.zoo``).
+
+    sb3-eqr train --algo eqr_rainbow --env CartPole-v1 --conf-file FILE_OR_NAME ...
+
+Every command is RL Zoo's own, with all of its flags; what is added is the agents ``eqr_qrdqn`` and ``eqr_rainbow``, their
+hyperparameter files, and messages instead of tracebacks for wrong use.
+"""
+
+try:
+    import rl_zoo3.import_envs  # noqa: F401
+except ImportError as error:
+    raise ImportError(f'sb3_eqr.zoo needs RL Zoo, found: {error}. pip install "sb3-eqr[zoo]"') from error
+
+from sb3_eqr.zoo.registration import AGENTS, register
+
+__all__ = ["AGENTS", "register"]

@@ -1,0 +1,108 @@
+"""What the Hugging Face Hub needs beside RL Zoo: a look before the upload, and a model card that names our commands."""
+
+import os
+import pathlib
+import shutil
+import tempfile
+from typing import Any
+
+import huggingface_hub
+import huggingface_sb3.push_to_hub as hub
+from huggingface_hub.repocard import metadata_eval_result
+
+REPLACED = {
+    "pip install rl_zoo3": 'pip install "sb3-eqr[zoo]"',
+    "python -m rl_zoo3.": "sb3-eqr ",
+}
+
+
+def correct_card(text: str) -> str:
+    """
+    :param text: a model card of RL Zoo's
+    :return: the same with commands that know our agents
+    """
+    for old, new in REPLACED.items():
+        text = text.replace(old, new)
+    second = text.find("If you installed the RL Zoo3 via pip")  # the same commands once more
+    end = text.find("## Training", second)
+    return text if second < 0 else text[:second] + text[end:]
+
+
+class CheckedHub(huggingface_hub.HfApi):
+    """Corrects the model card before the upload."""
+
+    def upload_folder(self, *, folder_path: str | pathlib.Path, **kwargs: Any) -> Any:  # type: ignore[override]
+        """As that of ``HfApi``."""
+        card = pathlib.Path(folder_path) / "README.md"
+        card.write_text(correct_card(card.read_text(encoding="utf-8")), encoding="utf-8")
+        return self._send(folder_path, kwargs)
+
+    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> Any:
+        return super().upload_folder(folder_path=folder_path, **kwargs)
+
+
+class DryHub(CheckedHub):
+    """Builds everything in the folder and sends nothing."""
+
+    def create_repo(self, repo_id: str, **kwargs: Any) -> str:  # type: ignore[override]
+        """
+        :return: what stands for the address
+        """
+        return f"{repo_id} (not uploaded)"
+
+    def snapshot_download(self, repo_id: str, *, local_dir: str | pathlib.Path, **kwargs: Any) -> str:  # type: ignore[override]
+        """
+        :return: the folder, made
+        """
+        pathlib.Path(local_dir).mkdir(parents=True, exist_ok=True)
+        return str(local_dir)
+
+    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> None:
+        print(f"--dry-run: built in {folder_path}, nothing was uploaded.")
+
+
+def generate_metadata(model_name: str, env_id: str, mean_reward: float, std_reward: float) -> dict[str, Any]:
+    """
+    The head of a model card, for RL Zoo 2.9, whose import of it fails beside current versions of Hugging Face's package.
+
+    :param model_name: name of the algorithm's class
+    :param env_id: the environment
+    :param mean_reward: mean return of the evaluation
+    :param std_reward: its standard deviation
+    :return: as https://huggingface.co/docs/hub/model-cards asks
+    """
+    return {
+        "library_name": "stable-baselines3",
+        "tags": [env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3-eqr"],
+        **metadata_eval_result(
+            model_pretty_name=model_name,
+            task_pretty_name="reinforcement-learning",
+            task_id="reinforcement-learning",
+            metrics_pretty_name="mean_reward",
+            metrics_id="mean_reward",
+            metrics_value=f"{mean_reward:.2f} +/- {std_reward:.2f}",
+            dataset_pretty_name=env_id,
+            dataset_id=env_id,
+        ),
+    }
+
+
+def prepare(dry_run: bool) -> None:
+    """
+    Set the stage for RL Zoo's ``push_to_hub``.
+
+    :param dry_run: whether to build the folder only
+    """
+    huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
+    hub.generate_metadata = generate_metadata
+    provide_ffmpeg()
+
+
+def provide_ffmpeg() -> None:
+    """Where there is no ``ffmpeg`` command, which the video needs, put that of moviepy in the path."""
+    if shutil.which("ffmpeg") is None:
+        import imageio_ffmpeg
+
+        folder = tempfile.mkdtemp(prefix="sb3-eqr-")
+        os.symlink(imageio_ffmpeg.get_ffmpeg_exe(), os.path.join(folder, "ffmpeg"))
+        os.environ["PATH"] += os.pathsep + folder
