@@ -1,10 +1,14 @@
 """The doors to RL Zoo: registration, hyperparameter files, messages."""
 
+import importlib.util
+import os
 import re
+import subprocess
 import sys
 
 import optuna
 import pytest
+import torch as th
 import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
@@ -38,6 +42,15 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_qrdqn --conf-file nofile", "none of .*eqr_bbf"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
         ("train --algo eqr_rainbow --conf-file eqr_qrdqn", "'n_quantiles' is no policy_kwargs of EqRRainbow"),
+        ("train --algo eqr_qrdqn --conf-file eqr_qrdqn.yml", "no file 'eqr_qrdqn.yml'. Did you mean 'eqr_qrdqn'?"),
+        ("train --algo dqn --conf-file eqr_qrdqn", "'n_quantiles' is no policy_kwargs of DQN"),
+        (
+            "train --algo eqr_qrdqn -params n_stepz:3 gamma:0.9",
+            "'n_stepz' is no argument of EqRQRDQN. Did you mean 'n_steps'?",
+        ),
+        ("train --algo eqr_qrdqn --env MinAtar/Breakot-v1", "Did you mean 'MinAtar/Breakout-v1'?"),
+        ("enjoy --algo eqr_qrdqn -f nowhere", "nowhere/eqr_qrdqn/?.* was not found.* train one first"),
+        ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
     ],
 )
 def test_wrong_use_is_told(sb3_eqr, capfd, line, message):
@@ -47,9 +60,43 @@ def test_wrong_use_is_told(sb3_eqr, capfd, line, message):
     assert re.search(message, capfd.readouterr().err)
 
 
+@pytest.mark.skipif(th.cuda.is_available(), reason="for machines without a GPU")
+def test_a_gpu_that_is_not_there(sb3_eqr, capfd):
+    with pytest.raises(SystemExit):
+        sb3_eqr("train --algo eqr_qrdqn --device cuda:1")
+    assert "cuda:1 was asked for, but PyTorch finds no GPU" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "package, line, advice",
+    [
+        ("wandb", "train --algo eqr_qrdqn --track", "pip install wandb"),
+        ("tensorboard", "train --algo eqr_qrdqn -tb tb", "pip install tensorboard"),
+        ("minatar", "train --algo eqr_qrdqn --env MinAtar/Breakout-v1", "pip install minatar"),
+        ("ale_py", "train --algo eqr_qrdqn --env PongNoFrameskip-v4", r'pip install "sb3-eqr\[atari\]"'),
+    ],
+)
+def test_missing_extras_are_named(sb3_eqr, capfd, monkeypatch, package, line, advice):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == package else find(name, *rest))
+    with pytest.raises(SystemExit):
+        sb3_eqr(line)
+    assert re.search(advice, capfd.readouterr().err)
+
+
+def test_a_missing_simulator_is_told_with_its_advice(sb3_eqr, capfd, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    for name in [name for name in sys.modules if name.startswith("gymnasium.envs.box2d")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(SystemExit):
+        sb3_eqr(f"train --algo eqr_qrdqn --env LunarLander-v3 -n 10 -f {tmp_path}")
+    assert "gymnasium[box2d]" in capfd.readouterr().err
+
+
 def test_unknown_keys_are_named_with_the_nearest(sb3_eqr, capfd, tmp_path):
     for entry, message in (
         ({"learning_rat": 0.1}, "'learning_rat' is no argument of EqRQRDQN. Did you mean 'learning_rate'?"),
+        ({"env_wrapper": "rl_zoo3.wrappers.HistoryWrapper"}, "Use frame_stack: 4 instead"),
         ({"policy_kwargs": {"n_block": 3}}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
     ):
         (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": {"policy": "MlpPolicy", **entry}}))
@@ -72,10 +119,11 @@ def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
 
 
 def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):
-    own = {"CartPole-v1": {"policy": "MlpPolicy", "n_timesteps": 60, "policy_kwargs": {"v_max": 100.0}}}
+    own = {"CartPole-v1": {"policy": "MlpPolicy", "n_timesteps": 60, "frame_stack": 3, "policy_kwargs": {"v_max": 100.0}}}
     (tmp_path / "own.yml").write_text(yaml.dump(own))
     sb3_eqr(f"train --algo eqr_rainbow --env CartPole-v1 --conf-file {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
-    assert EqRRainbow.load(tmp_path / "eqr_rainbow" / "CartPole-v1_1" / "CartPole-v1.zip").policy.v_max == 100
+    model = EqRRainbow.load(tmp_path / "eqr_rainbow" / "CartPole-v1_1" / "CartPole-v1.zip")
+    assert model.policy.v_max == 100 and model.observation_space.shape == (3 * 4,)
     assert find_hyperparameters("eqr_rainbow", "eqr_bbf") == str(configuration_files()["eqr_bbf"])
     assert find_hyperparameters("qrdqn", None) is None
     sb3_eqr(f"train --algo dqn --env CartPole-v1 -n 60 --eval-freq -1 -f {tmp_path}")
@@ -96,3 +144,116 @@ def test_the_search_space_makes_agents(name):
         groups.add(str(model.policy.group))
         assert model.gradient_steps >= 1 and (name == "eqr_qrdqn") != ("v_max" in sampled["policy_kwargs"])
     assert len(groups) > 1
+
+
+def test_the_flags_of_rl_zoo_together(sb3_eqr, tmp_path):
+    """Processes, normalisation, TensorBoard, checkpoints, a saved buffer: trained, played, gone on."""
+    entry = {
+        "policy": "MlpPolicy",
+        "n_timesteps": 200,
+        "n_envs": 2,
+        "normalize": True,
+        "env_wrapper": [{"rl_zoo3.wrappers.DelayedRewardWrapper": {"delay": 2}}, "rl_zoo3.wrappers.MaskVelocityWrapper"],
+        "learning_starts": 50,
+        "learning_rate": "lin_0.001",
+        "policy_kwargs": "dict(net_arch=[16])",
+    }
+    (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": entry}))
+    base = f"--algo eqr_qrdqn --env CartPole-v1 -f {tmp_path} --num-threads 1"
+    train = f"train {base} --conf-file {tmp_path}/own.yml --vec-env subproc --eval-freq 100 --eval-episodes 1 --seed 3"
+    sb3_eqr(f"{train} -P --save-replay-buffer --save-freq 100 -tb {tmp_path}/tb")
+    run = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
+    model = EqRQRDQN.load(run / "CartPole-v1.zip")
+    assert model.n_envs == 2 and model.num_timesteps == 200
+    assert (run / "rl_model_200_steps.zip").exists() and (run / "CartPole-v1" / "vecnormalize.pkl").exists()
+    assert list((tmp_path / "tb").rglob("events.*"))
+    assert "Loading" in sb3_eqr(f"enjoy {base} --no-render -n 30")
+    shown = sb3_eqr(f"{train} -n 100 -i {run}/CartPole-v1.zip")
+    assert "Loading replay buffer" in shown and "Loading saved VecNormalize stats" in shown
+    assert EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip").num_timesteps == 100
+
+
+def test_stacked_frames_and_named_configurations_on_atari(sb3_eqr, tmp_path):
+    line = "--algo eqr_rainbow --env PongNoFrameskip-v4 --conf-file der -params learning_starts:20 buffer_size:200"
+    sb3_eqr(f"train {line} -n 40 --eval-freq -1 -f {tmp_path}")
+    model = EqRRainbow.load(tmp_path / "eqr_rainbow" / "PongNoFrameskip-v4_1" / "PongNoFrameskip-v4.zip")
+    assert model.observation_space.shape == (4, 84, 84) and model._n_updates == 20
+
+
+def run_sb3_eqr(line, folder, **environment):
+    """In a process of its own."""
+    command = [sys.executable, "-m", "sb3_eqr.zoo", *line.split()]
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_two_processes_search_on_one_journal(tmp_path):
+    """Trials are shared, none is lost, none made twice."""
+    line = "train --algo eqr_qrdqn --env CartPole-v1 -n 120 -params learning_starts:100 -optimize --max-total-trials 6 "
+    line += "--n-trials 6 --n-evaluations 2 --eval-episodes 1 --storage search.log --study-name s --no-optim-plots -f logs"
+    processes = [run_sb3_eqr(f"{line} --seed {seed}", tmp_path) for seed in (1, 2)]
+    shown = [process.communicate(timeout=200)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], shown
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(tmp_path / "search.log")))
+    trials = optuna.load_study(study_name="s", storage=storage).trials
+    states = {trial.state for trial in trials}
+    assert len(trials) >= 6 and [trial.number for trial in trials] == list(range(len(trials)))
+    assert states <= {optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED}
+    finished = [len(re.findall(r"Trial \d+ (?:finished|pruned)", text)) for text in shown]
+    assert sum(finished) == len(trials) and min(finished) > 0
+
+
+def test_weights_and_biases_offline(tmp_path):
+    pytest.importorskip("wandb")
+    line = "train --algo eqr_qrdqn --env CartPole-v1 -n 1100 --eval-freq -1 --track --wandb-project-name eqr -f logs"
+    process = run_sb3_eqr(line, tmp_path, WANDB_MODE="offline", WANDB_SILENT="true")
+    shown, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, shown
+    assert list((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
+    assert list((tmp_path / "runs").rglob("events.*"))
+
+
+def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatch):
+    """A video; the folder for the Hub: card with our commands, video, model, settings."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    base = "--algo eqr_qrdqn --env CartPole-v1"
+    sb3_eqr(f"train {base} -n 64 --eval-freq -1")
+    sb3_eqr(f"record_video {base} -f logs -n 20 -o videos")
+    assert [path.suffix for path in (tmp_path / "videos").iterdir() if path.stat().st_size > 1000] == [".mp4"]
+    shown = sb3_eqr(f"push_to_hub {base} -f logs -n 20 -orga us --dry-run")
+    assert "nothing was uploaded" in shown
+    folder = tmp_path / "hub" / "eqr_qrdqn-CartPole-v1"
+    names = {path.name for path in folder.iterdir()}
+    assert {"README.md", "replay.mp4", "eqr_qrdqn-CartPole-v1.zip", "config.yml", "args.yml", "results.json"} <= names
+    card = (folder / "README.md").read_text()
+    head = yaml.safe_load(card.split("---")[1])
+    assert head["library_name"] == "stable-baselines3" and "sb3-eqr" in head["tags"]
+    assert head["model-index"][0]["name"] == "EqRQRDQN"
+    assert "sb3-eqr enjoy --algo eqr_qrdqn" in card and "rl_zoo3" not in card
+    assert EqRQRDQN.load(folder / "eqr_qrdqn-CartPole-v1.zip").num_timesteps == 64
+
+
+def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    line = "--env CartPole-v1 -n 128 --eval-freq 32 --eval-episodes 2"
+    for algo in ("eqr_qrdqn", "qrdqn", "eqr_qrdqn", "qrdqn"):
+        sb3_eqr(f"train --algo {algo} {line}")
+    table = sb3_eqr("all_plots -a eqr_qrdqn qrdqn -e CartPole-v1 -f logs --no-million --no-display -o results")
+    assert re.search(r"CartPole-v1\W+\d+ \+/- \d+\W+\d+ \+/- \d+", table)
+    sb3_eqr("plot_from_file -i results -o curves.png --format png --no-million")
+    assert (tmp_path / "curves.png").stat().st_size > 5_000
+    sb3_eqr("plot_train -a eqr_qrdqn -e CartPole-v1 -f logs -w 2")
+    sb3_eqr(f"train --algo dqn {line[:-1]}1")
+    with pytest.raises(SystemExit):
+        sb3_eqr("all_plots -a dqn -e CartPole-v1 -f logs --no-display")
+    assert "two evaluations of two episodes each" in capfd.readouterr().err

@@ -7,7 +7,6 @@ import runpy
 import sys
 
 import gymnasium as gym
-import numpy as np
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_model_path
 
@@ -29,6 +28,7 @@ MODULES = {
     "load_from_hub": "rl_zoo3.load_from_hub",
 }
 COMMANDS = [*FUNCTIONS, *MODULES]
+PLOTS = ("plot_from_file", "all_plots")
 LOADING = ("enjoy", "record_video", "push_to_hub")
 
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)}}} ...
@@ -118,10 +118,10 @@ def run(command: str, arguments: list[str]) -> None:
         fail(f'{command} needs {error.name}: pip install "sb3-eqr[zoo]"')
     except gym.error.DependencyNotInstalled as error:
         fail(str(error))
-    except np.exceptions.AxisError:
-        if command != "all_plots":
+    except ValueError as error:
+        if command not in PLOTS:
             raise
-        fail("all_plots needs at least two runs, or two episodes in each evaluation.")
+        fail(f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each.")
 
 
 def main() -> None:

@@ -103,10 +103,15 @@ def check_keys(entry: dict[str, Any], algo: str, source: str) -> None:
         if key not in legal:
             fail(f"{source}: {key!r} is no argument of {algorithm.__name__}.{nearest(key, legal)}")
     policy_kwargs = entry.get("policy_kwargs")
-    if not issubclass(algorithm, EqRAlgorithm) or not isinstance(policy_kwargs, dict):
-        return
-    policy = algorithm.policy_aliases["MlpPolicy"]
-    own = {name for kind in policy.__mro__[:2] for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
-    for key in policy_kwargs:
-        if key not in own:
-            fail(f"{source}: {key!r} is no policy_kwargs of {algorithm.__name__}.{nearest(key, own)}")
+    if isinstance(policy_kwargs, dict):
+        policy = algorithm.policy_aliases["MlpPolicy"]
+        kinds = policy.__mro__[: 2 if issubclass(algorithm, EqRAlgorithm) else 1]
+        own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
+        for key in policy_kwargs:
+            if key not in own:
+                fail(f"{source}: {key!r} is no policy_kwargs of {algorithm.__name__}.{nearest(key, own)}")
+    if issubclass(algorithm, EqRAlgorithm) and "HistoryWrapper" in str(entry.get("env_wrapper")):
+        fail(
+            f"{source}: RL Zoo's HistoryWrapper takes continuous actions, {algorithm.__name__} has discrete ones. "
+            "Use frame_stack: 4 instead."
+        )

@@ -1,5 +1,6 @@
 """What the Hugging Face Hub needs beside RL Zoo: a look before the upload, and a model card that names our commands."""
 
+import importlib
 import os
 import pathlib
 import shutil
@@ -7,7 +8,6 @@ import tempfile
 from typing import Any
 
 import huggingface_hub
-import huggingface_sb3.push_to_hub as hub
 from huggingface_hub.repocard import metadata_eval_result
 
 REPLACED = {
@@ -94,7 +94,7 @@ def prepare(dry_run: bool) -> None:
     :param dry_run: whether to build the folder only
     """
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
-    hub.generate_metadata = generate_metadata
+    importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
     provide_ffmpeg()
 
 

@@ -42,7 +42,7 @@ def make_sampler(categorical: bool) -> Callable[..., dict[str, Any]]:
         sampled = {
             "learning_rate": trial.suggest_float("learning_rate", 2e-4, 3e-3, log=True),
             "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.03, log=True),
-            "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 7),
+            "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 6),
             "train_freq_pow": trial.suggest_int("train_freq_pow", 0, 8),
             "replay_ratio": trial.suggest_categorical("replay_ratio", [0.25, 0.5, 1.0]),
             "n_steps": trial.suggest_int("n_steps", 1, 8),
@@ -50,7 +50,7 @@ def make_sampler(categorical: bool) -> Callable[..., dict[str, Any]]:
             "aet_coef": trial.suggest_categorical("aet_coef", [0.0, 0.1, 0.3, 1.0]),
             "get_coef": trial.suggest_categorical("get_coef", [0.0, 0.1, 0.3, 1.0]),
             "reward_coef": trial.suggest_categorical("reward_coef", [0.0, 0.1, 0.3, 1.0]),
-            "target_update_interval": trial.suggest_int("target_update_interval", 10, 1_000, log=True),
+            "target_update_interval": trial.suggest_int("target_update_interval", 100, 2_000, log=True),
             "exploration_fraction": trial.suggest_float("exploration_fraction", 0.05, 0.3),
             "exploration_final_eps": trial.suggest_float("exploration_final_eps", 0.01, 0.1),
             "group": trial.suggest_categorical("group", ["SE(2)", "SO(3)", "GL(2)", "T(2)"]),

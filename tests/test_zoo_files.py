@@ -1,0 +1,67 @@
+"""Every entry of every hyperparameter file builds its agent, by RL Zoo's own hands, and is trained by it."""
+
+import argparse
+
+import pytest
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
+
+from sb3_eqr import zoo
+from sb3_eqr.configurations import configuration_files
+
+GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
+ENVIRONMENTS = {
+    "atari",
+    "CartPole-v1",
+    "LunarLander-v3",
+    "MountainCar-v0",
+    "Acrobot-v1",
+    "BlindCliffwalk-v0",
+    *(f"MinAtar/{game}-v1" for game in GAMES),
+}
+CASES = [
+    (name, env_id)
+    for name, path in configuration_files().items()
+    for env_id in yaml.safe_load(path.read_text(encoding="utf-8"))
+]
+
+
+def algorithm_of(name):
+    return name.removeprefix("stock/") if name.startswith("stock/") else name if name == "eqr_qrdqn" else "eqr_rainbow"
+
+
+def test_every_file_has_its_environments():
+    found = {}
+    for name, env_id in CASES:
+        found.setdefault(name, set()).add(env_id)
+    full = {"eqr_qrdqn", "eqr_rainbow", "stock/dqn", "stock/qrdqn"}
+    assert {name for name, entries in found.items() if entries == ENVIRONMENTS} == full
+    assert all(entries == {"atari"} for name, entries in found.items() if name not in full)
+
+
+@pytest.mark.parametrize("name, entry", CASES, ids=lambda value: value)
+def test_every_entry_builds_its_agent(name, entry, tmp_path):
+    zoo.register()
+    path, algo = configuration_files()[name], algorithm_of(name)
+    env_id = "PongNoFrameskip-v4" if entry == "atari" else entry
+    manager = ExperimentManager(
+        argparse.Namespace(), algo, env_id, str(tmp_path), eval_freq=-1, config=str(path), device="cpu"
+    )
+    model, _ = manager.setup_experiment()
+    assert type(model) is ALGOS[algo]
+    written = yaml.safe_load(path.read_text(encoding="utf-8"))[entry]
+    assert manager.n_timesteps == written["n_timesteps"]
+    for key in ("batch_size", "buffer_size", "gamma", "n_steps", "learning_starts", "prediction_depth", "gradient_steps"):
+        if key in written:
+            assert getattr(model, key) == written[key], key
+    if "env_wrapper" in written:
+        shape = (4, 84, 84) if entry == "atari" else model.observation_space.shape
+        assert model.observation_space.shape == shape and shape[0] <= 10
+    # It can act and be trained as it stands.
+    model.learning_starts = 0
+    model.train_freq = 40
+    model._convert_train_freq()
+    model.gradient_steps = 1
+    model.learn(40)
+    assert model._n_updates == 1
