@@ -219,7 +219,7 @@ def test_weights_and_biases_offline(tmp_path):
     assert list((tmp_path / "runs").rglob("events.*"))
 
 
-def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatch):
+def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatch, capfd):
     """A video; the folder for the Hub: card with our commands, video, model, settings."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -227,8 +227,9 @@ def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatc
     sb3_eqr(f"train {base} -n 64 --eval-freq -1")
     sb3_eqr(f"record_video {base} -f logs -n 20 -o videos")
     assert [path.suffix for path in (tmp_path / "videos").iterdir() if path.stat().st_size > 1000] == [".mp4"]
-    shown = sb3_eqr(f"push_to_hub {base} -f logs -n 20 -orga us --dry-run")
-    assert "nothing was uploaded" in shown
+    with pytest.raises(SystemExit) as left:
+        sb3_eqr(f"push_to_hub {base} -f logs -n 20 -orga us --dry-run")
+    assert left.value.code == 0 and "nothing was uploaded" in capfd.readouterr().out
     folder = tmp_path / "hub" / "eqr_qrdqn-CartPole-v1"
     names = {path.name for path in folder.iterdir()}
     assert {"README.md", "replay.mp4", "eqr_qrdqn-CartPole-v1.zip", "config.yml", "args.yml", "results.json"} <= names

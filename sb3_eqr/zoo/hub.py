@@ -5,13 +5,13 @@ import os
 import pathlib
 import shutil
 import tempfile
-from typing import Any
+from typing import Any, NoReturn
 
 import huggingface_hub
 from huggingface_hub.repocard import metadata_eval_result
 
 REPLACED = {
-    "pip install rl_zoo3": 'pip install "sb3-eqr[zoo]"',
+    "pip install rl_zoo3": 'pip install "sb3-eqr[atari,zoo]"',
     "python -m rl_zoo3.": "sb3-eqr ",
 }
 
@@ -57,8 +57,9 @@ class DryHub(CheckedHub):
         pathlib.Path(local_dir).mkdir(parents=True, exist_ok=True)
         return str(local_dir)
 
-    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> None:
+    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> NoReturn:
         print(f"--dry-run: built in {folder_path}, nothing was uploaded.")
+        raise SystemExit(0)  # before RL Zoo tells of a success
 
 
 def generate_metadata(model_name: str, env_id: str, mean_reward: float, std_reward: float) -> dict[str, Any]:
