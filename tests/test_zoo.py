@@ -50,6 +50,8 @@ def sb3_eqr(monkeypatch, capfd):
         ),
         ("train --algo eqr_qrdqn --env MinAtar/Breakot-v1", "Did you mean 'MinAtar/Breakout-v1'?"),
         ("enjoy --algo eqr_qrdqn -f nowhere", "nowhere/eqr_qrdqn/?.* was not found.* train one first"),
+        ("enjoy --algo eqr_qrdqn", "was not found.* train one first"),
+        ("train --algo eqr_qrdqn -i nothing.zip", "expected the path of a .zip file.*'nothing.zip'"),
         ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
     ],
 )
@@ -97,6 +99,7 @@ def test_unknown_keys_are_named_with_the_nearest(sb3_eqr, capfd, tmp_path):
     for entry, message in (
         ({"learning_rat": 0.1}, "'learning_rat' is no argument of EqRQRDQN. Did you mean 'learning_rate'?"),
         ({"env_wrapper": "rl_zoo3.wrappers.HistoryWrapper"}, "Use frame_stack: 4 instead"),
+        ({"normalize": True, "frame_stack": 4}, "RL Zoo normalises before it stacks. Leave one of them out."),
         ({"policy_kwargs": {"n_block": 3}}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
     ):
         (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": {"policy": "MlpPolicy", **entry}}))

@@ -12,7 +12,16 @@ from rl_zoo3.utils import get_model_path
 
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import check_algo, check_environment, check_file, check_keys, check_machine, fail, nearest
+from sb3_eqr.zoo.checks import (
+    check_algo,
+    check_environment,
+    check_file,
+    check_keys,
+    check_machine,
+    check_trained_agent,
+    fail,
+    nearest,
+)
 
 # The functions and modules of rl_zoo3 behind each command.
 FUNCTIONS = {
@@ -61,6 +70,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
     parser.add_argument("--device", default="auto")
+    parser.add_argument("-i", "--trained-agent", default="")
     parser.add_argument("--track", action="store_true")
     parser.add_argument("-tb", "--tensorboard-log", default="")
     parser.add_argument("--gym-packages", nargs="+", default=[])
@@ -80,6 +90,7 @@ def check_training(args: argparse.Namespace) -> str | None:
     path = find_hyperparameters(args.algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
     check_machine(args.device, args.track, args.tensorboard_log)
+    check_trained_agent(args.trained_agent)
     if path is not None:
         check_file(path, args.env, args.algo)
     check_keys(dict.fromkeys(pair.split(":")[0] for pair in args.hyperparams), args.algo, "--hyperparams")
@@ -142,7 +153,8 @@ def main() -> None:
         arguments = [argument for argument in arguments if argument != "--dry-run"]
     if not wants_help and command in ("train", *MODULES, "enjoy"):
         check_algo(args.algo)
-    if not wants_help and command in LOADING and args.folder != "rl-trained-agents":  # RL Zoo downloads into that
+    is_on_hub = args.folder == "rl-trained-agents" and args.algo not in AGENTS  # RL Zoo downloads stock agents into that
+    if not wants_help and command in LOADING and not is_on_hub:
         check_trained(args)
     if not wants_help and command == "train":
         path = check_training(args)

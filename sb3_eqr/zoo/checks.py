@@ -110,8 +110,22 @@ def check_keys(entry: dict[str, Any], algo: str, source: str) -> None:
         for key in policy_kwargs:
             if key not in own:
                 fail(f"{source}: {key!r} is no policy_kwargs of {algorithm.__name__}.{nearest(key, own)}")
-    if issubclass(algorithm, EqRAlgorithm) and "HistoryWrapper" in str(entry.get("env_wrapper")):
+    if issubclass(algorithm, EqRAlgorithm):
+        check_wrappers(entry, algorithm.__name__, source)
+
+
+def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:
+    """Leave with a message if RL Zoo would wrap the environment in a way that our agents cannot use."""
+    if "HistoryWrapper" in str(entry.get("env_wrapper")):
         fail(
-            f"{source}: RL Zoo's HistoryWrapper takes continuous actions, {algorithm.__name__} has discrete ones. "
+            f"{source}: RL Zoo's HistoryWrapper takes continuous actions, {name} has discrete ones. "
             "Use frame_stack: 4 instead."
         )
+    if entry.get("normalize") and entry.get("frame_stack"):
+        fail(f"{source}: with both normalize and frame_stack, RL Zoo normalises before it stacks. Leave one of them out.")
+
+
+def check_trained_agent(path: str) -> None:
+    """Leave with a message if there is nothing to continue from."""
+    if path and not (path.endswith(".zip") and pathlib.Path(path).is_file()):
+        fail(f"--trained-agent: expected the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, found {path!r}.")
