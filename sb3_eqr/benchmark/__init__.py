@@ -1,1 +1,1 @@
-"""Measuring EqR. ``python -m sb3_eqr.benchmark.speed`` prints what a step costs."""
+"""Measuring EqR: ``python -m sb3_eqr.benchmark.speed`` prints what a step costs, ``reference`` holds published scores."""
