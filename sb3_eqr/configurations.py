@@ -3,6 +3,8 @@
 import pathlib
 from typing import Any
 
+from stable_baselines3.common.utils import LinearSchedule
+
 ZOO_KEYS = ("policy", "n_timesteps", "frame_stack", "n_envs", "normalize", "env_wrapper")  # read by RL Zoo itself
 STOCK = "stock"  # the folder of settings for SB3's own agents
 
@@ -41,7 +43,10 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
         raise ValueError(f"configuration {name!r}: expected an entry of {list(entries)}, found {env_id!r}")
-    return _merged({key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}, changes)
+    arguments = {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}
+    if isinstance(arguments.get("learning_rate"), str):  # RL Zoo's lin_1e-3: from there to 0
+        arguments["learning_rate"] = LinearSchedule(float(arguments["learning_rate"].removeprefix("lin_")), 0.0, 1.0)
+    return _merged(arguments, changes)
 
 
 def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:

@@ -158,6 +158,12 @@ def test_changes_are_merged():
     assert changed == plain
 
 
+def test_rl_zoos_schedules_are_schedules():
+    """lin_1.5e-3 in the file: from there to 0."""
+    learning_rate = load_configuration("stock/qrdqn", "LunarLander-v3")["learning_rate"]
+    assert [learning_rate(remaining) for remaining in (1, 0.5, 0)] == pytest.approx([1.5e-3, 0.75e-3, 0])
+
+
 def test_unknown_names_are_told():
     with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
         load_configuration("bbf")
