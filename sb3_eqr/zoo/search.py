@@ -59,7 +59,7 @@ def make_sampler(categorical: bool) -> Callable[..., dict[str, Any]]:
             "noisy": trial.suggest_categorical("noisy", [False, True]),
         }
         if categorical:
-            sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 300])
+            sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 200, 400])
         return convert_eqr_params(sampled)
 
     return sample_eqr_params
