@@ -44,6 +44,11 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
     if env_id not in entries:
         raise ValueError(f"configuration {name!r}: expected an entry of {list(entries)}, found {env_id!r}")
     arguments = {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}
+    if isinstance(arguments.get("policy_kwargs"), str):
+        raise ValueError(
+            f"configuration {name!r}, {env_id!r}: its policy_kwargs are Python that only RL Zoo evaluates. "
+            f"Use sb3-eqr train --conf-file {name}, or write them out."
+        )
     if isinstance(arguments.get("learning_rate"), str):  # RL Zoo's lin_1e-3: from there to 0
         arguments["learning_rate"] = LinearSchedule(float(arguments["learning_rate"].removeprefix("lin_")), 0.0, 1.0)
     return _merged(arguments, changes)

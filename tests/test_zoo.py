@@ -6,15 +6,20 @@ import re
 import subprocess
 import sys
 
+import gymnasium as gym
+import huggingface_hub
+import numpy as np
 import optuna
 import pytest
 import torch as th
 import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.env_checker import check_env
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, zoo
+from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
 from sb3_eqr.configurations import configuration_files
+from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
 
 
@@ -101,11 +106,55 @@ def test_unknown_keys_are_named_with_the_nearest(sb3_eqr, capfd, tmp_path):
         ({"env_wrapper": "rl_zoo3.wrappers.HistoryWrapper"}, "Use frame_stack: 4 instead"),
         ({"normalize": True, "frame_stack": 4}, "RL Zoo normalises before it stacks. Leave one of them out."),
         ({"policy_kwargs": {"n_block": 3}}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
+        ({"policy_kwargs": "dict(n_block=3)"}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
+        ({"policy_kwargs": "dict(n_block=)"}, "cannot be evaluated"),
+        ({"seed": 3}, "'seed' cannot stand there: RL Zoo sets it by --seed"),
     ):
-        (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": {"policy": "MlpPolicy", **entry}}))
+        whole = {"policy": "MlpPolicy", "n_timesteps": 100, **entry}
+        (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": whole}))
         with pytest.raises(SystemExit):
             sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 --conf-file {tmp_path}/own.yml")
         assert message in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("CartPole-v1: {policy: MlpPolicy}", "the entry 'CartPole-v1' needs 'n_timesteps'"),
+        ("CartPole-v1:", "the entry 'CartPole-v1' needs 'policy'"),
+        ("CartPole-v1: {policy: [}", "is no YAML"),
+        ("", "no entry for 'CartPole-v1'"),
+    ],
+)
+def test_broken_files_are_told(sb3_eqr, capfd, tmp_path, text, message):
+    (tmp_path / "own.yml").write_text(text)
+    with pytest.raises(SystemExit):
+        sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 --conf-file {tmp_path}/own.yml")
+    assert message in capfd.readouterr().err
+
+
+def test_abbreviations_mean_what_they_mean_in_rl_zoo(sb3_eqr, capfd, tmp_path):
+    """A file given as --conf is used; wrong use under short names is told, too."""
+    (tmp_path / "own.yml").write_text("CartPole-v1: {policy: MlpPolicy, n_timesteps: 30, gamma: 0.5}")
+    sb3_eqr(f"train --alg eqr_qrdqn --conf {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
+    assert EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip").gamma == 0.5
+    with pytest.raises(SystemExit):
+        sb3_eqr("train --alg eqr_qrdqn --hyperp n_stepz:3")
+    assert "'n_stepz' is no argument" in capfd.readouterr().err
+
+
+def test_other_agents_pass(sb3_eqr, tmp_path):
+    """Policies that we do not know, and files that RL Zoo brings."""
+    own = {
+        "policy": "MlpLstmPolicy",
+        "n_timesteps": 16,
+        "n_steps": 8,
+        "batch_size": 8,
+        "policy_kwargs": {"lstm_hidden_size": 8},
+    }
+    (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": own}))
+    sb3_eqr(f"train --algo ppo_lstm --env CartPole-v1 --conf-file {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
+    assert (tmp_path / "ppo_lstm" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
 
 
 def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
@@ -136,13 +185,14 @@ def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):
 @pytest.mark.parametrize("name", zoo.AGENTS)
 def test_the_search_space_makes_agents(name):
     """Every drawn set of parameters builds an agent; the converter gives the same from what the study has stored."""
-    zoo.register()
+    zoo.register(policy_kwargs={"log_std": 1, "group": "T(2)"})  # the first is kept, the second is searched
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     groups = set()
     for _ in range(8):
         trial = study.ask()
         sampled = HYPERPARAMS_SAMPLER[name](trial, 2, 1, {})
-        assert HYPERPARAMS_CONVERTER[name](trial.params) == sampled
+        assert HYPERPARAMS_CONVERTER[name](trial.params) == sampled and sampled["policy_kwargs"]["log_std"] == 1
+        del sampled["policy_kwargs"]["log_std"]
         model = ALGOS[name]("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu", **sampled)
         groups.add(str(model.policy.group))
         assert model.gradient_steps >= 1 and (name == "eqr_qrdqn") != ("v_max" in sampled["policy_kwargs"])
@@ -171,9 +221,10 @@ def test_the_flags_of_rl_zoo_together(sb3_eqr, tmp_path):
     assert (run / "rl_model_200_steps.zip").exists() and (run / "CartPole-v1" / "vecnormalize.pkl").exists()
     assert list((tmp_path / "tb").rglob("events.*"))
     assert "Loading" in sb3_eqr(f"enjoy {base} --no-render -n 30")
-    shown = sb3_eqr(f"{train} -n 100 -i {run}/CartPole-v1.zip")
+    shown = sb3_eqr(f"{train} -n 100 -i {run}/CartPole-v1.zip -params learning_starts:0 exploration_initial_eps:0.05")
     assert "Loading replay buffer" in shown and "Loading saved VecNormalize stats" in shown
-    assert EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip").num_timesteps == 100
+    continued = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip")
+    assert continued.num_timesteps == 100 and continued._n_updates == model._n_updates + 100  # two steps, two updates
 
 
 def test_stacked_frames_and_named_configurations_on_atari(sb3_eqr, tmp_path):
@@ -205,11 +256,9 @@ def test_two_processes_search_on_one_journal(tmp_path):
     assert [process.returncode for process in processes] == [0, 0], shown
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(tmp_path / "search.log")))
     trials = optuna.load_study(study_name="s", storage=storage).trials
-    states = {trial.state for trial in trials}
-    assert len(trials) >= 6 and [trial.number for trial in trials] == list(range(len(trials)))
-    assert states <= {optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED}
-    finished = [len(re.findall(r"Trial \d+ (?:finished|pruned)", text)) for text in shown]
-    assert sum(finished) == len(trials) and min(finished) > 0
+    assert {trial.state for trial in trials} <= {optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED}
+    told = [int(number) for text in shown for number in re.findall(r"Trial (\d+) (?:finished|pruned)", text)]
+    assert len(trials) >= 6 and sorted(told) == list(range(len(trials)))  # each once, in one of the two
 
 
 def test_weights_and_biases_offline(tmp_path):
@@ -242,6 +291,62 @@ def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatc
     assert head["model-index"][0]["name"] == "EqRQRDQN"
     assert "sb3-eqr enjoy --algo eqr_qrdqn" in card and "rl_zoo3" not in card
     assert EqRQRDQN.load(folder / "eqr_qrdqn-CartPole-v1.zip").num_timesteps == 64
+
+    # The way back, with the folder in the place of the Hub.
+    fetch = f"load_from_hub {base} -f fetched -orga us"
+    with pytest.raises(SystemExit):
+        sb3_eqr(fetch)
+    assert "TRUST_REMOTE_CODE=True sb3-eqr" in capfd.readouterr().err and "TRUST_REMOTE_CODE=True sb3-eqr" in card
+
+    def download(repo_id, filename, **_):
+        assert repo_id == "us/eqr_qrdqn-CartPole-v1"
+        if not (folder / filename).exists():
+            raise huggingface_hub.errors.LocalEntryNotFoundError(filename)
+        return str(folder / filename)
+
+    monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    sb3_eqr(fetch)
+    assert "Loading" in sb3_eqr(f"enjoy {base} --no-render -n 20 -f fetched")
+
+
+@pytest.mark.parametrize("env_id", ["MinAtar/Breakout-v1", "BlindCliffwalk-v0"])
+def test_worlds_are_filmed(env_id):
+    """Every picture is uint8 and shows something."""
+    envs.register()
+    env = gym.make(env_id, render_mode="rgb_array")
+    if env_id.startswith("MinAtar"):
+        env = ChannelsFirstImage(env)
+        assert env.observation_space.shape[1:] == (10, 10) and env.reset(seed=0)[0].max() == 255
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.shape in ((320, 320, 3), (32, 320, 3))
+    assert picture.max() > 200 and picture.min() < 100
+    assert picture[0, 0].tolist() == picture[31, 31].tolist()  # 32 pixels for one
+    check_env(env.unwrapped if env_id == "BlindCliffwalk-v0" else env, skip_render_check=True)
+
+
+def test_minatar_is_searched_and_repeats_itself(sb3_eqr, tmp_path):
+    """The search keeps the small encoder of the entry; one seed gives one game."""
+    line = "train --algo eqr_rainbow --env MinAtar/Freeway-v1 -n 60 -params learning_starts:50 buffer_size:100"
+    shown = sb3_eqr(f"{line} -optimize --n-trials 1 --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}")
+    assert "Number of finished trials:  1" in shown
+    games = []
+    for _ in range(2):
+        env = gym.make("MinAtar/Asterix-v1")
+        observations = [env.reset(seed=5)[0]]
+        observations += [env.step(step % 3)[0] for step in range(50)]
+        games.append(np.array(observations))
+    assert (games[0] == games[1]).all()
+
+
+def test_the_script_without_rl_zoo(monkeypatch):
+    """One line, not a traceback."""
+    for name in [name for name in sys.modules if name.startswith("sb3_eqr.zoo")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rl_zoo3.import_envs", None)
+    with pytest.raises(SystemExit, match=r'sb3-eqr: .*pip install "sb3-eqr\[zoo\]"'):
+        cli.main()
 
 
 def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):

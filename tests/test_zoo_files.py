@@ -56,8 +56,8 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
         if key in written:
             assert getattr(model, key) == written[key], key
     if "env_wrapper" in written:
-        shape = (4, 84, 84) if entry == "atari" else model.observation_space.shape
-        assert model.observation_space.shape == shape and shape[0] <= 10
+        assert model.observation_space.dtype == "uint8"
+        assert model.observation_space.shape[1:] == ((84, 84) if entry == "atari" else (10, 10))
     # It can act and be trained as it stands.
     model.learning_starts = 0
     model.train_freq = 40

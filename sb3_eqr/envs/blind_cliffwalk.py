@@ -17,12 +17,16 @@ class BlindCliffwalk(gym.Env):
 
     :param n_states: n ≥ 1
     :param seed: draws the right action of each state
+    :param render_mode: "rgb_array": a row of squares, the present state white
     :raises ValueError: for a number of states below 1
     """
 
-    def __init__(self, n_states: int = 10, seed: int = 0):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(self, n_states: int = 10, seed: int = 0, render_mode: str | None = None):
         check_number("n_states", n_states, 1, whole=True)
         self.n_states = n_states
+        self.render_mode = render_mode
         self.observation_space = spaces.Discrete(n_states)
         self.action_space = spaces.Discrete(2)
         self.right_actions = np.random.default_rng(seed).integers(0, 2, n_states)
@@ -47,6 +51,15 @@ class BlindCliffwalk(gym.Env):
             return self.state, 1.0, True, False, {}
         self.state += 1
         return self.state, 0.0, False, False, {}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        :return: with ``render_mode="rgb_array"`` (32, 32 n_states, 3), uint8
+        """
+        if self.render_mode is None:
+            return None
+        row = np.where(np.arange(self.n_states) == self.state, 255, 60).astype(np.uint8)
+        return row[None, :, None].repeat(32, axis=0).repeat(32, axis=1).repeat(3, axis=2)
 
     def q_values(self, gamma: float) -> np.ndarray:
         """

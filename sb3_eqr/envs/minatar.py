@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+PIXELS = 32  # of a picture, for each of the game
 GAMES = {
     "Asterix": "asterix",
     "Breakout": "breakout",
@@ -42,3 +43,12 @@ class ChannelsFirstImage(gym.ObservationWrapper):
         :return: (channels, height, width), uint8: 0 or 255
         """
         return np.moveaxis(observation, 2, 0).astype(np.uint8) * np.uint8(255)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        :return: with ``render_mode="rgb_array"`` (320, 320, 3), uint8, where MinAtar itself gives 10×10 floats in [0, 1]
+        """
+        picture = self.env.render()
+        if not isinstance(picture, np.ndarray) or self.render_mode != "rgb_array":
+            return None
+        return (255 * picture).astype(np.uint8).repeat(PIXELS, axis=0).repeat(PIXELS, axis=1)

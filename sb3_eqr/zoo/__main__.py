@@ -8,20 +8,12 @@ import sys
 
 import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import get_model_path
+from rl_zoo3.utils import StoreDict, get_model_path
 
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import (
-    check_algo,
-    check_environment,
-    check_file,
-    check_keys,
-    check_machine,
-    check_trained_agent,
-    fail,
-    nearest,
-)
+from sb3_eqr.zoo.checks import check_algo, check_environment, check_machine, check_trained_agent, fail, nearest
+from sb3_eqr.zoo.entries import check_entry, read_entry
 
 # The functions and modules of rl_zoo3 behind each command.
 FUNCTIONS = {
@@ -37,8 +29,12 @@ MODULES = {
     "load_from_hub": "rl_zoo3.load_from_hub",
 }
 COMMANDS = [*FUNCTIONS, *MODULES]
-PLOTS = ("plot_from_file", "all_plots")
+PLOTS = ("plot_train", "plot_from_file", "all_plots")
 LOADING = ("enjoy", "record_video", "push_to_hub")
+DOWNLOADS = "rl-trained-agents"  # where enjoy looks, and puts what it downloads
+
+# What the extra brings.
+EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)}}} ...
 
@@ -55,45 +51,55 @@ def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
     files = configuration_files()
     if conf_file is None:
         return str(files[algo]) if algo in AGENTS else None
-    if conf_file in files and not pathlib.Path(conf_file).exists():
+    if conf_file in files and not pathlib.Path(conf_file).is_file():
         return str(files[conf_file])
     return conf_file
 
 
-def make_parser() -> argparse.ArgumentParser:
+def parse(arguments: list[str]) -> argparse.Namespace:
     """
-    :return: for what is looked at here; RL Zoo parses everything once more
+    :param arguments: of ``train`` or of a command that loads an agent
+    :return: what is looked at here; RL Zoo parses everything once more
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="ppo")
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-conf", "--conf-file")
-    parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
     parser.add_argument("--device", default="auto")
     parser.add_argument("-i", "--trained-agent", default="")
     parser.add_argument("--track", action="store_true")
     parser.add_argument("-tb", "--tensorboard-log", default="")
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("-f", "--folder", default="rl-trained-agents")
+    parser.add_argument("-f", "--folder", default=DOWNLOADS)
     parser.add_argument("--exp-id", type=int, default=0)
     parser.add_argument("--load-best", action="store_true")
     parser.add_argument("--load-checkpoint")
     parser.add_argument("--load-last-checkpoint", action="store_true")
-    return parser
+    try:
+        return parser.parse_known_args(arguments)[0]
+    except (NameError, SyntaxError) as error:
+        fail(f"--hyperparams: expected key:value, the value in Python ('text' in quotes), found one that is not: {error}")
 
 
-def check_training(args: argparse.Namespace) -> str | None:
+def prepare_training(args: argparse.Namespace) -> str | None:
     """
+    Check everything before RL Zoo starts.
+
     :param args: of ``train``
     :return: the file of hyperparameters to use; ``None``: RL Zoo's own
     """
-    path = find_hyperparameters(args.algo, args.conf_file)
+    algo = args.algo or "ppo"
+    path = find_hyperparameters(algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
     check_machine(args.device, args.track, args.tensorboard_log)
     check_trained_agent(args.trained_agent)
-    if path is not None:
-        check_file(path, args.env, args.algo)
-    check_keys(dict.fromkeys(pair.split(":")[0] for pair in args.hyperparams), args.algo, "--hyperparams")
+    if path is None:
+        check_entry(args.hyperparams, algo, "--hyperparams")
+        return None
+    entry = read_entry(path, args.env, args.hyperparams)
+    check_entry(entry, algo, path)
+    register(policy_kwargs=entry.get("policy_kwargs"))
     return path
 
 
@@ -103,7 +109,7 @@ def check_trained(args: argparse.Namespace) -> None:
         get_model_path(
             args.exp_id,
             args.folder,
-            args.algo,
+            args.algo or "ppo",
             EnvironmentName(args.env),
             args.load_best,
             args.load_checkpoint,
@@ -126,13 +132,20 @@ def run(command: str, arguments: list[str]) -> None:
             module, function = FUNCTIONS[command].split(":")
             getattr(importlib.import_module(module), function)()
     except ModuleNotFoundError as error:
-        fail(f'{command} needs {error.name}: pip install "sb3-eqr[zoo]"')
+        advice = ' pip install "sb3-eqr[zoo]" brings it.' if str(error.name).split(".")[0] in EXTRA else ""
+        fail(f"{command}: {error}.{advice}")
     except gym.error.DependencyNotInstalled as error:
         fail(str(error))
-    except ValueError as error:
-        if command not in PLOTS:
+    except AssertionError as error:
+        if "as action spaces but" not in str(error):
             raise
-        fail(f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each.")
+        fail(f"{command}: {error}. These agents need discrete actions.")
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        if command in PLOTS:
+            fail(f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each.")
+        if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):
+            fail(f"{error} So: TRUST_REMOTE_CODE=True sb3-eqr load_from_hub ...")
+        raise
 
 
 def main() -> None:
@@ -144,22 +157,24 @@ def main() -> None:
     if command not in COMMANDS:
         fail(f"expected one of {', '.join(COMMANDS)}, found {command!r}.{nearest(command, COMMANDS)}")
     register()
-    args, _ = make_parser().parse_known_args(arguments)
-    wants_help = bool({"-h", "--help"} & set(arguments))
-    if command == "push_to_hub":
+    if command.endswith("_hub"):
         from sb3_eqr.zoo import hub
 
         hub.prepare("--dry-run" in arguments)
         arguments = [argument for argument in arguments if argument != "--dry-run"]
-    if not wants_help and command in ("train", *MODULES, "enjoy"):
-        check_algo(args.algo)
-    is_on_hub = args.folder == "rl-trained-agents" and args.algo not in AGENTS  # RL Zoo downloads stock agents into that
-    if not wants_help and command in LOADING and not is_on_hub:
-        check_trained(args)
-    if not wants_help and command == "train":
-        path = check_training(args)
-        if path is not None and path != args.conf_file:
-            arguments = [*arguments, "--conf-file", path]  # the last one counts
+    if command not in PLOTS and not {"-h", "--help"} & set(arguments):
+        args = parse(arguments)
+        if args.algo is not None:
+            check_algo(args.algo)
+        if command == "train":
+            path = prepare_training(args)
+            if path != args.conf_file:
+                arguments = [*arguments, "--conf-file", str(path)]  # the last one counts
+        elif command in LOADING and args.algo is not None:
+            check_machine(args.device, False, "")
+            downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
+            if not downloads:
+                check_trained(args)
     run(command, arguments)
 
 

@@ -8,8 +8,11 @@ import tempfile
 from typing import Any, NoReturn
 
 import huggingface_hub
+import huggingface_sb3
+import requests
 from huggingface_hub.repocard import metadata_eval_result
 
+DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {
     "pip install rl_zoo3": 'pip install "sb3-eqr[atari,zoo]"',
     "python -m rl_zoo3.": "sb3-eqr ",
@@ -23,6 +26,7 @@ def correct_card(text: str) -> str:
     """
     for old, new in REPLACED.items():
         text = text.replace(old, new)
+    text = text.replace("\nsb3-eqr load_from_hub", "\nTRUST_REMOTE_CODE=True sb3-eqr load_from_hub")  # it unpickles
     second = text.find("If you installed the RL Zoo3 via pip")  # the same commands once more
     end = text.find("## Training", second)
     return text if second < 0 else text[:second] + text[end:]
@@ -88,14 +92,28 @@ def generate_metadata(model_name: str, env_id: str, mean_reward: float, std_rewa
     }
 
 
+def load_from_hub(repo_id: str, filename: str) -> str:
+    """
+    :param repo_id: of the repository
+    :param filename: in it
+    :return: where the file is after the download
+    :raises requests.HTTPError: if there is no such file: what RL Zoo 2.9 expects where normalisation is not used
+    """
+    try:
+        return DOWNLOAD(repo_id, filename)
+    except huggingface_hub.errors.EntryNotFoundError as error:
+        raise requests.HTTPError(str(error)) from error
+
+
 def prepare(dry_run: bool) -> None:
     """
-    Set the stage for RL Zoo's ``push_to_hub``.
+    Set the stage for RL Zoo's ``push_to_hub`` and ``load_from_hub``.
 
     :param dry_run: whether to build the folder only
     """
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
     importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
+    huggingface_sb3.load_from_hub = load_from_hub
     provide_ffmpeg()
 
 

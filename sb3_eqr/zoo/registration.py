@@ -1,5 +1,8 @@
 """The agents in RL Zoo's tables."""
 
+from functools import partial
+from typing import Any
+
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
@@ -10,10 +13,15 @@ from sb3_eqr.zoo.search import convert_eqr_params, make_sampler
 AGENTS: dict[str, type[EqRAlgorithm]] = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}
 
 
-def register() -> None:
-    """Put the agents into RL Zoo's tables, with their search spaces, and the package's environments into gymnasium's."""
+def register(policy_kwargs: dict[str, Any] | None = None) -> None:
+    """
+    Put the agents into RL Zoo's tables, with their search spaces, and the package's environments into gymnasium's.
+
+    :param policy_kwargs: those that a search keeps as they are
+    """
     ALGOS.update(AGENTS)  # type: ignore[arg-type]
+    kept = policy_kwargs or {}
     for name in AGENTS:
-        HYPERPARAMS_SAMPLER[name] = make_sampler(categorical=name == "eqr_rainbow")
-        HYPERPARAMS_CONVERTER[name] = convert_eqr_params  # type: ignore[assignment]
+        HYPERPARAMS_SAMPLER[name] = make_sampler(name == "eqr_rainbow", kept)
+        HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
     envs.register()

@@ -6,14 +6,16 @@ from typing import Any
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 
 
-def convert_eqr_params(sampled: dict[str, Any]) -> dict[str, Any]:
+def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled: values of the search, by the names of :func:`make_sampler`
+    :param kept: ``policy_kwargs`` that are not searched; RL Zoo would drop them
     :return: keyword arguments of the agent
     """
     params = dict(sampled)
     batch_size, train_freq = 2 ** params.pop("batch_size_pow"), 2 ** params.pop("train_freq_pow")
     policy_kwargs: dict[str, Any] = {
+        **kept,
         "group": params.pop("group"),
         "n_blocks": params.pop("n_blocks"),
         "net_arch": NET_ARCHS[params.pop("net_arch")],
@@ -32,9 +34,10 @@ def convert_eqr_params(sampled: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_sampler(categorical: bool) -> Callable[..., dict[str, Any]]:
+def make_sampler(categorical: bool, kept: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """
     :param categorical: whether the range of returns is searched, too
+    :param kept: ``policy_kwargs`` that are not searched
     :return: a search space for RL Zoo: group, blocks, depth, the three coefficients, learning rate, n-step, replay ratio
     """
 
@@ -60,6 +63,6 @@ def make_sampler(categorical: bool) -> Callable[..., dict[str, Any]]:
         }
         if categorical:
             sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 200, 400])
-        return convert_eqr_params(sampled)
+        return convert_eqr_params(sampled, kept)
 
     return sample_eqr_params

@@ -1,0 +1,12 @@
+"""The console script ``sb3-eqr``."""
+
+import sys
+
+
+def main() -> None:
+    """Run the command line, or tell what to install for it."""
+    try:
+        from sb3_eqr.zoo.__main__ import main as run
+    except ImportError as error:
+        sys.exit(f"sb3-eqr: {error}")
+    run()

@@ -1,0 +1,112 @@
+"""Entries of hyperparameter files, read as RL Zoo reads them, and what can be wrong with them."""
+
+import importlib
+import importlib.util
+import inspect
+import pathlib
+from typing import Any
+
+import yaml
+from rl_zoo3 import exp_manager
+from rl_zoo3.utils import ALGOS
+
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from sb3_eqr.zoo.checks import fail, nearest
+
+# What RL Zoo takes out of an entry before it calls the constructor.
+ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
+# What it passes to the constructor itself.
+FLAGS = {
+    "env": "--env",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
+    "tensorboard_log": "--tensorboard-log",
+    "_init_setup_model": "nothing",
+}
+
+
+def read_file(path: str) -> dict[str, Any]:
+    """
+    :param path: a YAML file, a Python file or a Python package, the last two with a dictionary ``hyperparams``
+    :return: its entries; leaves with a message if it cannot be read
+    """
+    if not path.endswith((".yml", ".yaml", ".py")):
+        if importlib.util.find_spec(path.split(".")[0]) is None:
+            fail(f"--conf-file: {path!r} is no file, no Python package, and none of {', '.join(configuration_files())}.")
+        return importlib.import_module(path).hyperparams
+    file = pathlib.Path(path)
+    if not file.is_file():
+        fail(f"--conf-file: there is no file {path!r}.{nearest(path, configuration_files())}")
+    if path.endswith(".py"):
+        found: dict[str, Any] = {}
+        exec(file.read_text(encoding="utf-8"), found)
+        return found["hyperparams"]
+    try:
+        return yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        fail(f"{path} is no YAML: {error}")
+
+
+def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param path: of the file
+    :param env_id: the environment
+    :param changes: of the command line
+    :return: the entry with the changes, ``policy_kwargs`` evaluated; leaves with a message if there is none
+    """
+    entries = read_file(path)
+    is_atari = exp_manager.ExperimentManager.is_atari(env_id)
+    name = env_id if env_id in entries else "atari" if is_atari else "default"
+    if name not in entries:
+        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries)}. Add one, or pass --conf-file with another file.")
+    entry = {**(entries[name] or {}), **changes}
+    for key in ("policy", "n_timesteps"):
+        if key not in entry:
+            fail(f"{path}: the entry {name!r} needs {key!r}.")
+    if isinstance(entry.get("policy_kwargs"), str):
+        try:
+            entry["policy_kwargs"] = eval(entry["policy_kwargs"], vars(exp_manager))
+        except Exception as error:
+            fail(f"{path}: policy_kwargs: {entry['policy_kwargs']!r} cannot be evaluated ({error}).")
+    return entry
+
+
+def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
+    """
+    Leave with a message if there is a key that no constructor takes, or wrappers that our agents cannot use.
+
+    :param entry: hyperparameters for one environment
+    :param algo: the algorithm that they are for
+    :param source: where they stand
+    """
+    algorithm = ALGOS[algo]
+    legal = ENTRY_KEYS | set(inspect.signature(algorithm).parameters) - FLAGS.keys()
+    for key in entry:
+        if key in FLAGS:
+            fail(f"{source}: {key!r} cannot stand there: RL Zoo sets it by {FLAGS[key]}.")
+        if key not in legal:
+            fail(f"{source}: {key!r} is no argument of {algorithm.__name__}.{nearest(key, legal)}")
+    policy = algorithm.policy_aliases.get(entry.get("policy", ""))
+    policy_kwargs = entry.get("policy_kwargs")
+    if policy is not None and isinstance(policy_kwargs, dict):
+        kinds = [policy, *(kind for kind in policy.__mro__ if issubclass(kind, EqRPolicy))]
+        own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
+        for key in policy_kwargs:
+            if key not in own:
+                fail(f"{source}: {key!r} is no policy_kwargs of {algorithm.__name__}.{nearest(key, own)}")
+    if issubclass(algorithm, EqRAlgorithm):
+        check_wrappers(entry, algorithm.__name__, source)
+
+
+def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:
+    """Leave with a message if RL Zoo would wrap the environment in a way that our agents cannot use."""
+    if "HistoryWrapper" in str(entry.get("env_wrapper")):
+        fail(
+            f"{source}: RL Zoo's HistoryWrapper takes continuous actions, {name} has discrete ones. "
+            "Use frame_stack: 4 instead."
+        )
+    if entry.get("normalize") and entry.get("frame_stack"):
+        fail(f"{source}: with both normalize and frame_stack, RL Zoo normalises before it stacks. Leave one of them out.")
