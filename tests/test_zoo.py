@@ -350,9 +350,10 @@ def test_the_script_without_rl_zoo(monkeypatch):
 
 
 def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
-    import matplotlib
+    import matplotlib.pyplot
 
     matplotlib.use("Agg")
+    monkeypatch.setattr("matplotlib.pyplot.show", matplotlib.pyplot.show)  # to be put back
     monkeypatch.chdir(tmp_path)
     line = "--env CartPole-v1 -n 128 --eval-freq 32 --eval-episodes 2"
     for algo in ("eqr_qrdqn", "qrdqn", "eqr_qrdqn", "qrdqn"):
@@ -362,6 +363,8 @@ def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
     sb3_eqr("plot_from_file -i results -o curves.png --format png --no-million")
     assert (tmp_path / "curves.png").stat().st_size > 5_000
     sb3_eqr("plot_train -a eqr_qrdqn -e CartPole-v1 -f logs -w 2")
+    sb3_eqr("all_plots -a eqr_qrdqn qrdqn -e CartPole-v1 -f logs")
+    assert (tmp_path / "all_plots-1.png").stat().st_size > 5_000  # no display: saved
     sb3_eqr(f"train --algo dqn {line[:-1]}1")
     with pytest.raises(SystemExit):
         sb3_eqr("all_plots -a dqn -e CartPole-v1 -f logs --no-display")

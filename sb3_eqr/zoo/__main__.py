@@ -119,6 +119,20 @@ def check_trained(args: argparse.Namespace) -> None:
         fail(f"{error}. Pass -f with the folder given to train (logs by default), or train one first.")
 
 
+def save_where_nothing_is_shown(command: str) -> None:
+    """Without a display matplotlib shows nothing: write the figures into files instead."""
+    import matplotlib.pyplot as plt
+
+    def save(*_: object, **__: object) -> None:
+        for number in plt.get_fignums():
+            name = f"{command}-{number}.png"
+            plt.figure(number).savefig(name, dpi=150)
+            print(f"No display: saved {name}")
+
+    if plt.get_backend().lower() == "agg":
+        plt.show = save
+
+
 def run(command: str, arguments: list[str]) -> None:
     """
     :param command: one of ``COMMANDS``
@@ -126,6 +140,8 @@ def run(command: str, arguments: list[str]) -> None:
     """
     sys.argv = [f"sb3-eqr {command}", *arguments]
     try:
+        if command in PLOTS:
+            save_where_nothing_is_shown(command)
         if command in MODULES:
             runpy.run_module(MODULES[command], run_name="__main__")
         else:
