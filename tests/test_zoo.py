@@ -46,9 +46,9 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_qrdqn --gym-packages nopackage", "'nopackage' cannot be imported"),
         ("train --algo eqr_qrdqn --conf-file nofile", "none of .*eqr_bbf"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
-        ("train --algo eqr_rainbow --conf-file eqr_qrdqn", "'n_quantiles' is no policy_kwargs of EqRRainbow"),
+        ("train --algo eqr_rainbow --conf-file stock/qrdqn", "'n_quantiles' is no policy_kwargs of EqRRainbow"),
         ("train --algo eqr_qrdqn --conf-file eqr_qrdqn.yml", "no file 'eqr_qrdqn.yml'. Did you mean 'eqr_qrdqn'?"),
-        ("train --algo dqn --conf-file eqr_qrdqn", "'n_quantiles' is no policy_kwargs of DQN"),
+        ("train --algo dqn --conf-file stock/qrdqn", "'n_quantiles' is no policy_kwargs of DQN"),
         (
             "train --algo eqr_qrdqn -params n_stepz:3 gamma:0.9",
             "'n_stepz' is no argument of EqRQRDQN. Did you mean 'n_steps'?",
@@ -163,7 +163,7 @@ def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
     assert str(configuration_files()["eqr_qrdqn"]) in shown
     saved = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
     assert (saved / "CartPole-v1.zip").exists() and (saved / "best_model.zip").exists()
-    assert EqRQRDQN.load(saved / "CartPole-v1.zip").num_timesteps == 128  # two rounds of 64
+    assert EqRQRDQN.load(saved / "CartPole-v1.zip").num_timesteps == 128  # a round
     shown = sb3_eqr(f"enjoy --algo eqr_qrdqn --env CartPole-v1 --no-render -n 60 {folder}")
     assert "Episode Reward" in shown or "Mean reward" in shown
     sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 -n 50 --eval-freq -1 -i {saved}/CartPole-v1.zip {folder}")
@@ -290,7 +290,7 @@ def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatc
     assert head["library_name"] == "stable-baselines3" and "sb3-eqr" in head["tags"]
     assert head["model-index"][0]["name"] == "EqRQRDQN"
     assert "sb3-eqr enjoy --algo eqr_qrdqn" in card and "rl_zoo3" not in card
-    assert EqRQRDQN.load(folder / "eqr_qrdqn-CartPole-v1.zip").num_timesteps == 64
+    assert EqRQRDQN.load(folder / "eqr_qrdqn-CartPole-v1.zip").num_timesteps == 128  # a round
 
     # The way back, with the folder in the place of the Hub.
     fetch = f"load_from_hub {base} -f fetched -orga us"
