@@ -1,5 +1,6 @@
 import itertools
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common import buffers
 
 ACTIONS = spaces.Discrete(4)
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -297,6 +299,15 @@ def test_memory_per_transition_at_atari_size():
     assert buffer.nbytes / 2_000 <= 8_500
     stock = ReplayBuffer(10, space, ACTIONS, "cpu")
     assert (stock.observations.nbytes + stock.next_observations.nbytes) / 10 > 56_000
+
+
+@pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
+def test_too_large_for_the_machine_is_warned_of(buffer_class, monkeypatch):
+    """psutil is there where Ray is."""
+    memory = SimpleNamespace(virtual_memory=lambda: SimpleNamespace(available=1_000))
+    monkeypatch.setattr(buffers, "psutil", memory)
+    with pytest.warns(UserWarning, match="not have apparently enough memory"):
+        buffer_class(100, spaces.Box(0, 1, (3,)), spaces.Discrete(2), "cpu")
 
 
 def test_memory_does_not_grow_once_the_ring_is_full():

@@ -84,10 +84,11 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.dones = np.zeros(shape, dtype=np.float32)
         self.timeouts = np.zeros(shape, dtype=np.float32)
         self._episode_starts = np.ones(n_envs, dtype=bool)
-        if psutil is not None and self.nbytes > psutil.virtual_memory().available:
+        available = np.inf if psutil is None else psutil.virtual_memory().available
+        if self._stored_bytes > available:
             warnings.warn(
                 "This system does not have apparently enough memory to store the complete replay buffer "
-                f"{self.nbytes / 1e9:.2f}GB > {psutil.virtual_memory().available / 1e9:.2f}GB"
+                f"{self._stored_bytes / 1e9:.2f}GB > {available / 1e9:.2f}GB"
             )
 
     def _check_arguments(self, frame_stack: int) -> None:
@@ -110,6 +111,10 @@ class SequenceReplayBuffer(ReplayBuffer):
     @property
     def nbytes(self) -> int:
         """Memory of everything stored, in bytes."""
+        return self._stored_bytes
+
+    @property
+    def _stored_bytes(self) -> int:
         arrays = (self.actions, self.rewards, self.dones, self.timeouts)
         return sum(store.nbytes for store in self._stores.values()) + sum(array.nbytes for array in arrays)
 
