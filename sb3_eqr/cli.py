@@ -6,7 +6,11 @@ import sys
 def main() -> None:
     """Run the command line, or tell what to install for it."""
     try:
-        from sb3_eqr.zoo.__main__ import main as run
+        if sys.argv[1:2] == ["benchmark"]:
+            del sys.argv[1]
+            from sb3_eqr.benchmark.__main__ import main as run
+        else:
+            from sb3_eqr.zoo.__main__ import main as run
     except ImportError as error:
         sys.exit(f"sb3-eqr: {error}")
     run()

@@ -1,0 +1,125 @@
+"""The command line: ``sb3-eqr benchmark run|status|report``."""
+
+import argparse
+import pathlib
+import shlex
+import sys
+
+from rich.console import Console
+
+from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of, write_plan
+from sb3_eqr.benchmark.run import ERROR, Settings
+from sb3_eqr.benchmark.runner import make_table, run_benchmark
+from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.zoo.checks import check_machine, fail
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    :return: of the three commands
+    """
+    parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents, with evidence.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command goes on where it stopped")
+    run.add_argument("folder", type=pathlib.Path, help="where everything is written")
+    run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, or one of --suite-file")
+    run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
+    run.add_argument("--agents", nargs="+", help="ALGO or ALGO:ENTRIES, such as qrdqn, qrdqn:stock, eqr_rainbow:se2+aet")
+    run.add_argument("--games", nargs="+", help="some games of the suite (default: all)")
+    run.add_argument("--seeds", type=int, default=5, help="number of seeds, from 0 (default: 5)")
+    run.add_argument("--steps", type=int, help="training steps instead of the suite's")
+    run.add_argument("--device", default="auto", help="of PyTorch (default: auto)")
+    run.add_argument("--address", help="of a Ray cluster that sees the folder (default: this machine)")
+    run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs, and threads of PyTorch, of a run (default: 1)")
+    run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs of a run, such as 0.1 (default: 0)")
+    run.add_argument("--checkpoint-every", type=float, default=300.0, metavar="SECONDS", help="(default: 300)")
+    status = commands.add_parser("status", help="where a benchmark stands")
+    status.add_argument("folder", type=pathlib.Path)
+    report = commands.add_parser("report", help="scores, tables, figures and report.html")
+    report.add_argument("folders", nargs="+", type=pathlib.Path, metavar="folder", help="of a benchmark, or of several")
+    report.add_argument("--reference", action="append", default=[], metavar="NAME=FILE", help="JSON: game -> scores of runs")
+    report.add_argument("--force", action="store_true", help="put agents of different protocols into one table, and mark them")
+    report.add_argument("--output", type=pathlib.Path, help="where it is written (default: FOLDER/report)")
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: of ``run``
+    :return: exit status: 1 if a run failed
+    """
+    check_machine(args.device, False, "")
+    if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
+        raise ValueError(
+            f"--cpus-per-run, --gpus-per-run: expected > 0 and >= 0, found {args.cpus_per_run} and {args.gpus_per_run}"
+        )
+    if args.suite is None and args.agents is None:
+        runs = read_plan(args.folder)
+    elif args.suite is None or args.agents is None:
+        raise ValueError("expected both --suite and --agents, or neither to go on with what the folder holds")
+    else:
+        if args.steps is not None and args.steps < 1:
+            raise ValueError(f"--steps: expected at least 1, found {args.steps}")
+        suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
+        runs = plan_runs(args.folder, suite, args.agents, args.seeds)
+        write_plan(args.folder, suite, runs)
+    command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
+    settings = Settings(command, args.device, max(int(args.cpus_per_run), 1), args.checkpoint_every)
+    console = Console()
+    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
+    for run_ in failed:
+        console.print(f"failed: {run_.agent.name}, {run_.game}, seed {run_.seed}: {run_.folder / ERROR}", style="bold")
+    if failed:
+        console.print("The same command tries them again, from their last checkpoints.")
+    else:
+        console.print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
+    return 1 if failed else 0
+
+
+def status(args: argparse.Namespace) -> int:
+    """
+    :param args: of ``status``
+    :return: exit status
+    """
+    runs = read_plan(args.folder)
+    states = [state_of(run) for run in runs]
+    console = Console()
+    console.print(make_table(runs, states))
+    for run, state in zip(runs, states, strict=True):
+        if state.name == "failed":
+            reason = (run.folder / ERROR).read_text(encoding="utf-8").strip().splitlines()[-1]
+            console.print(f"failed: {run.agent.name}, {run.game}, seed {run.seed}: {reason}")
+    return 0
+
+
+def report(args: argparse.Namespace) -> int:
+    """
+    :param args: of ``report``
+    :return: exit status
+    """
+    from sb3_eqr.benchmark.report import write_report
+
+    references = {}
+    for text in args.reference:
+        name, separator, path = text.partition("=")
+        if not (name and separator and path):
+            raise ValueError(f"--reference: expected NAME=FILE, found {text!r}")
+        references[name] = pathlib.Path(path)
+    output = args.output or args.folders[0] / "report"
+    print(f"Written: {write_report(args.folders, references, args.force, output)}")
+    return 0
+
+
+def main() -> None:
+    """Parse the command line and do what it says."""
+    args = make_parser().parse_args()
+    try:
+        sys.exit({"run": run, "status": status, "report": report}[args.command](args))
+    except (ValueError, ImportError, ConnectionError, OSError) as error:
+        fail(f"benchmark {args.command}: {error}")
+    except KeyboardInterrupt:
+        fail("stopped. The same command goes on from the last checkpoints.")
+
+
+if __name__ == "__main__":
+    main()

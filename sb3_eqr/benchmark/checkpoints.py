@@ -1,0 +1,118 @@
+"""Checkpoints of a run: everything that training goes on from, in a folder that appears whole or not at all."""
+
+import os
+import pathlib
+import pickle
+import shutil
+from typing import Any
+
+import cloudpickle
+from gymnasium.utils import EzPickle
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
+
+PREFIX = "checkpoint-"  # and the step
+
+
+def environment_chain(env: VecEnv) -> list[VecEnv]:
+    """
+    :return: the vectorised environment, from the outermost wrapper to the environments themselves
+    """
+    chain = [env]
+    while isinstance(env, VecEnvWrapper):
+        env = env.venv
+        chain.append(env)
+    return chain
+
+
+def pickle_environment(env: VecEnv) -> bytes | None:
+    """
+    :return: the state of all environments and wrappers; ``None`` if an environment cannot be pickled in its state, as ALE and
+        Box2D, which pickle as new ones (``EzPickle``)
+    """
+    chain = environment_chain(env)
+    games = chain[-1]
+    if not isinstance(games, DummyVecEnv) or any(isinstance(game.unwrapped, EzPickle) for game in games.envs):
+        return None
+    states = [{k: v for k, v in vars(link).items() if k not in ("venv", "class_attributes")} for link in chain]
+    try:
+        return cloudpickle.dumps(states)
+    except (TypeError, pickle.PicklingError):
+        return None
+
+
+def write_checkpoint(folder: pathlib.Path, model: BaseAlgorithm, record: dict[str, Any], is_final: bool = False) -> None:
+    """
+    Call it between two rollouts. The checkpoint before stays until this one is whole.
+
+    :param folder: of the run
+    :param model: the agent
+    :param record: what was measured so far
+    :param is_final: training is over: no replay buffer is needed any more
+    """
+    env = model.get_env()
+    assert env is not None
+    name = f"{PREFIX}{model.num_timesteps:012d}"
+    partial = folder / f".{name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        model.save(partial / "model.zip")
+        if isinstance(model, OffPolicyAlgorithm) and not is_final:
+            model.save_replay_buffer(partial / "replay_buffer.pkl")
+        state = {"record": record, "rng": get_rng_state(model.action_space), "environment": pickle_environment(env)}
+        (partial / "state.pkl").write_bytes(cloudpickle.dumps(state))
+        for file in partial.iterdir():
+            with open(file, "rb") as written:
+                os.fsync(written.fileno())
+        old = find_checkpoints(folder)
+        if old and old[-1].name == name:  # of the same step: nothing has happened since
+            return
+        os.replace(partial, folder / name)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    for checkpoint in old:
+        shutil.rmtree(checkpoint, ignore_errors=True)
+
+
+def find_checkpoints(folder: pathlib.Path) -> list[pathlib.Path]:
+    """
+    :return: whole checkpoints, the last one last
+    """
+    return sorted(folder.glob(f"{PREFIX}*"))
+
+
+def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[BaseAlgorithm, dict[str, Any], bool]:
+    """
+    :param checkpoint: of :func:`write_checkpoint`
+    :param model: newly built, whose class, device and environment are used
+    :return: the agent that goes on, what was measured so far, and whether it goes on bit for bit; if not, from a fresh episode
+    """
+    state = cloudpickle.loads((checkpoint / "state.pkl").read_bytes())
+    is_exact = state["environment"] is not None
+    env = model.get_env()
+    assert env is not None
+    model = type(model).load(checkpoint / "model.zip", env=env, device=model.device, force_reset=not is_exact)
+    if isinstance(model, OffPolicyAlgorithm) and (checkpoint / "replay_buffer.pkl").is_file():
+        model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
+        buffer = model.replay_buffer
+        if not is_exact and hasattr(buffer, "timeouts"):  # no n-step return across the gap
+            buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
+    env = model.get_env()
+    assert env is not None
+    if is_exact:
+        for link, values in zip(environment_chain(env), cloudpickle.loads(state["environment"]), strict=True):
+            vars(link).update(values)
+    else:
+        env.seed((model.seed or 0) + model.num_timesteps)  # other episodes than at the start
+    set_rng_state(state["rng"], model.action_space)
+    return model, state["record"], is_exact
+
+
+def remove_checkpoints(folder: pathlib.Path) -> None:
+    """Those of a finished run, and what a killed one has left of them."""
+    for checkpoint in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*")]:
+        shutil.rmtree(checkpoint, ignore_errors=True)

@@ -1,0 +1,213 @@
+"""One run of a benchmark: its protocol, its checkpoints, what it writes."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_eqr.benchmark import run as run_module
+from sb3_eqr.benchmark.agents import Agent, find_agent
+from sb3_eqr.benchmark.checkpoints import find_checkpoints
+from sb3_eqr.benchmark.evaluation import evaluate
+from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings, execute
+
+STEPS = 400
+SHARED = "policy: MlpPolicy\n  n_timesteps: 1000\n  policy_kwargs: {net_arch: [16]}\n"
+OFF_POLICY = "  learning_starts: 100\n  batch_size: 8\n  train_freq: 8\n  gradient_steps: 2\n  buffer_size: 300\n"
+NORMALISED = "  normalize: {norm_obs: true, norm_reward: true}\n"
+EQR = SHARED.replace("[16]", "[16], n_blocks: 2") + OFF_POLICY + "  n_steps: 3\n  prediction_depth: 2\n"
+AGENTS = {
+    "eqr_qrdqn": EQR + NORMALISED,
+    "eqr_rainbow": EQR.replace("}", ", v_min: 0.0, v_max: 100.0}") + "  reset_interval: 40\n",
+    "qrdqn": SHARED + OFF_POLICY + "  n_steps: 3\n",
+    "dqn": SHARED + OFF_POLICY + "  n_envs: 2\n" + NORMALISED,
+    "ppo": SHARED + "  n_envs: 2\n  n_steps: 16\n  batch_size: 8\n  n_epochs: 1\n",
+}
+
+
+def protocol(steps=STEPS, env_id="CartPole-v1", epsilon=0.0, n_envs=2, max_steps=None, points=4):
+    curve = {"points": points, "episodes": 3}
+    evaluation = {
+        "episodes": 5,
+        "n_envs": n_envs,
+        "epsilon": epsilon,
+        "max_steps": max_steps,
+        "preprocessing": {},
+        "curve": curve,
+    }
+    return {"env_id": env_id, "steps": steps, "preprocessing": {}, "evaluation": evaluation}
+
+
+def make_run(folder, algo, entry=None, game="CartPole-v1", **kwargs):
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "entry.yml"
+    file.write_text(f"{game}:\n  {AGENTS[algo] if entry is None else entry}")
+    find_agent(algo)  # registers ours
+    return Run(folder / "run", Agent(algo, algo, file), "own", game, 3, protocol(env_id=game, **kwargs))
+
+
+def result_of(run):
+    return json.loads((run.folder / RESULT).read_text())
+
+
+def scores_of(run):
+    result = result_of(run)
+    return result["evaluations"], result["training"]
+
+
+def stop_at(monkeypatch, *steps):
+    """Training stops with an exception when it first comes to each of these steps."""
+    ahead = list(steps)
+    on_step = run_module.RunCallback._on_step
+
+    def step_or_stop(self):
+        if ahead and self.num_timesteps >= ahead[0]:
+            raise KeyError(f"stopped at {ahead.pop(0)}")
+        return on_step(self)
+
+    monkeypatch.setattr(run_module.RunCallback, "_on_step", step_or_stop)
+
+
+@pytest.mark.parametrize("algo", AGENTS)
+def test_a_stopped_run_ends_with_the_scores_of_an_undisturbed_one(algo, tmp_path, monkeypatch):
+    undisturbed = make_run(tmp_path / "undisturbed", algo)
+    assert execute(undisturbed, Settings()) == "finished"
+    stopped = make_run(tmp_path / "stopped", algo)
+    often = Settings(checkpoint_seconds=0.0)
+    stop_at(monkeypatch, 150, 310)
+    for _ in range(2):
+        with pytest.raises(KeyError, match="stopped at"):
+            execute(stopped, often)
+        assert "stopped at" in (stopped.folder / ERROR).read_text() and len(find_checkpoints(stopped.folder)) == 1
+    assert execute(stopped, often) == "finished"
+    assert scores_of(stopped) == scores_of(undisturbed)
+    result = result_of(stopped)
+    assert (
+        result["attempts"] == 3
+        and result["resumed_exactly"]
+        and 0 < result["resumed_at"][0] < 150 < result["resumed_at"][1] < 310
+    )
+    assert sorted(path.name for path in stopped.folder.iterdir()) == [LOCK, RESULT]
+    assert execute(stopped, often) == "finished"
+
+
+def test_what_is_written_beside_the_scores(tmp_path):
+    run = make_run(tmp_path, "eqr_qrdqn", points=4)
+    execute(run, Settings(command="sb3-eqr benchmark run x"))
+    result = result_of(run)
+    assert [(row["step"], row["kind"], len(row["scores"])) for row in result["evaluations"]] == [
+        (100, "curve", 3),
+        (200, "curve", 3),
+        (300, "curve", 3),
+        (400, "final", 5),
+    ]
+    training = result["training"]
+    assert training["step"] == np.cumsum(training["length"]).tolist() and training["step"][-1] <= STEPS
+    assert training["score"] == training["length"]  # CartPole, although the agent learns from normalised rewards
+    assert result["entry"]["hyperparameters"]["learning_starts"] == 100 and result["protocol"] == run.protocol
+    assert result["versions"]["torch"] and result["machine"]["device"] == "cpu" and result["machine"]["threads"] == 1
+    assert result["wall_clock_s"] >= result["training_seconds"] > 0
+    assert result["steps_per_second"] == pytest.approx(STEPS / result["training_seconds"], abs=0.01)
+    assert {"aet_loss", "get_loss", "reward_loss", "td_loss", "step"} <= result["losses"][-1].keys()
+
+
+class Corridor(gym.Env):
+    """Episodes last as long as their seed says: the environments of a batch end at different times."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+    episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.length = 3 if seed % 2 else 30
+        self.left = self.length
+        return np.zeros(2, dtype=np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.zeros(2, dtype=np.float32), float(action), self.left == 0, False, {}
+
+
+class Fixed:
+    """An agent that always takes action 0."""
+
+    action_space = Corridor.action_space
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        return np.zeros(len(observation), dtype=int), None
+
+    def get_vec_normalize_env(self):
+        return None
+
+
+@pytest.fixture
+def corridor(monkeypatch):
+    spec = gym.envs.registration.EnvSpec("Corridor-v0", entry_point=Corridor)
+    monkeypatch.setitem(gym.registry, "Corridor-v0", spec)
+    return "Corridor-v0"
+
+
+def test_short_episodes_are_not_counted_more_often(corridor):
+    """Ten episodes in two environments: five of 30 steps and five of 3, where the first ten to end would be mostly short."""
+    state = np.random.get_state()[1].copy()
+    scores, lengths = evaluate(Fixed(), protocol(env_id=corridor), {}, 10, seed=0)
+    assert sorted(lengths) == [3] * 5 + [30] * 5 and scores == [0.0] * 10
+    assert (np.random.get_state()[1] == state).all()
+
+
+def test_epsilon_and_the_limit_of_steps(corridor):
+    """Random actions are 1 half of the time; nothing else scores."""
+    limited = protocol(env_id=corridor, epsilon=0.4, max_steps=20)
+    scores, lengths = evaluate(Fixed(), limited, {}, 400, seed=0)
+    assert set(lengths) == {3, 20}
+    assert sum(scores) / sum(lengths) == pytest.approx(0.2, abs=0.02)
+    assert evaluate(Fixed(), limited, {}, 400, seed=0) == (scores, lengths) != evaluate(Fixed(), limited, {}, 400, seed=1)
+
+
+def test_evaluations_wait_until_a_reset_is_over(tmp_path):
+    """From step 100 on two updates follow each round of 8 steps; every 40 updates, 160 steps, the network is reset."""
+    run = make_run(tmp_path, "eqr_rainbow", points=20)
+    execute(run, Settings())
+    result = result_of(run)
+    steps = [row["step"] for row in result["evaluations"] if row["kind"] == "curve"]
+    reset = 104 + 160  # the round that starts with the 41st update
+    assert [step for step in steps if reset < step <= reset + 72] == []
+    assert steps[:13] == list(range(20, 261, 20)) and steps[13] > reset + 72
+
+
+def test_a_run_that_another_process_has_is_left_alone(tmp_path):
+    from filelock import FileLock
+
+    run = make_run(tmp_path, "dqn")
+    run.folder.mkdir()
+    with FileLock(run.folder / LOCK):
+        assert execute(run, Settings()) == "busy"
+    assert not (run.folder / RESULT).exists()
+
+
+def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monkeypatch):
+    undisturbed, full = make_run(tmp_path / "undisturbed", "qrdqn"), make_run(tmp_path / "full", "qrdqn")
+    execute(undisturbed, Settings())
+    save, calls = run_module.write_checkpoint, []
+
+    def no_space_at_the_fifth(folder, model, record, is_final=False):
+        calls.append(model.num_timesteps)
+        if len(calls) == 5:
+            monkeypatch.setattr(type(model), "save_replay_buffer", no_space)
+        save(folder, model, record, is_final)
+
+    def no_space(self, path):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run_module, "write_checkpoint", no_space_at_the_fifth)
+    with monkeypatch.context(), pytest.raises(OSError, match="No space left"):
+        execute(full, Settings(checkpoint_seconds=0.0))
+    assert [path.name for path in full.folder.glob("*checkpoint*")] == [f"checkpoint-{calls[3]:012d}"]
+    monkeypatch.undo()
+    execute(full, Settings())
+    assert scores_of(full) == scores_of(undisturbed)
