@@ -9,8 +9,10 @@ import pytest
 from sb3_eqr.benchmark import run as run_module
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.checkpoints import find_checkpoints
-from sb3_eqr.benchmark.evaluation import evaluate
+from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
 from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings, execute
+from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.envs import atari, make_atari100k_env
 
 STEPS = 400
 SHARED = "policy: MlpPolicy\n  n_timesteps: 1000\n  policy_kwargs: {net_arch: [16]}\n"
@@ -211,3 +213,39 @@ def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monk
     monkeypatch.undo()
     execute(full, Settings())
     assert scores_of(full) == scores_of(undisturbed)
+
+
+def test_atari_is_evaluated_on_whole_games_as_the_paper_does():
+    """The protocol of the suite, beside the environment that the package makes for evaluation."""
+    suite = choose(load_suite("atari100k-5"), ["Boxing"], None)
+    env = make_evaluation_env(suite.protocol("Boxing"), {}, Fixed(), seed=4)
+    assert suite.protocol("Boxing")["evaluation"]["n_envs"] == env.num_envs == 10
+    plain = make_atari100k_env("Boxing", n_envs=10, seed=4, training=False)
+    rng = np.random.default_rng(0)
+    assert np.array_equal(env.reset(), plain.reset())
+    total = np.zeros(10)
+    for _ in range(100):
+        actions = rng.integers(0, env.action_space.n, 10)
+        (obs, rewards, dones, _), (plain_obs, plain_rewards, plain_dones, _) = env.step(actions), plain.step(actions)
+        assert np.array_equal(obs, plain_obs) and np.array_equal(rewards, plain_rewards) and np.array_equal(dones, plain_dones)
+        total += rewards
+    assert np.abs(total).max() > 1
+
+
+def test_an_endless_atari_game_is_counted_when_its_steps_are_over(monkeypatch):
+    monkeypatch.setattr(atari, "MAX_STEPS", 50)
+    suite = choose(load_suite("atari100k-5"), ["Boxing"], None)
+    _, lengths = evaluate(Fixed(), suite.protocol("Boxing"), {}, 20, seed=0)
+    assert lengths == [50] * 20
+
+
+def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
+    """LunarLander cannot be pickled in the middle of an episode."""
+    run = make_run(tmp_path, "qrdqn", game="LunarLander-v3")
+    stop_at(monkeypatch, 200)
+    with pytest.raises(KeyError):
+        execute(run, Settings(checkpoint_seconds=0.0))
+    execute(run, Settings())
+    result = result_of(run)
+    assert not result["resumed_exactly"] and result["resumed_at"] == [192]
+    assert result["training"]["step"] and result["evaluations"][-1]["step"] == STEPS

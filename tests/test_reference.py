@@ -1,8 +1,19 @@
 """The bundled figures give the last rows that the paper prints."""
 
+import json
+import pathlib
+
 import pytest
 
-from sb3_eqr.benchmark.reference import human_normalized, load_reference
+from sb3_eqr.benchmark.reference import (
+    disagreements,
+    human_normalized,
+    last_rows,
+    load_reference,
+    match_games,
+    published_table,
+    read_runs,
+)
 
 # mean, median, games above human, as printed under Tables 2, 3 and 4
 PRINTED = {
@@ -50,3 +61,69 @@ def test_what_is_bundled(scores):
 def test_unknown_games_are_named(scores):
     with pytest.raises(ValueError, match="found tetris"):
         human_normalized(scores.head(1).assign(game="tetris"))
+
+
+def test_the_last_rows_are_printed_ones_but_for_two():
+    rows = last_rows()
+    names = {2: "Tab2", 3: "Tab3", 4: "Tab4"}
+    for row in rows.to_dict("records"):
+        found = [
+            values
+            for method, values in PRINTED.items()
+            if method.replace("$", "") == f"{row['method']} [EqR {names[row['table']]}]"
+        ]
+        assert found == [(row["printed_mean"], row["printed_median"], row["printed_superhuman"])]
+    assert len(rows) == len(PRINTED)
+    assert disagreements(rows) == [
+        "SPR in Table 2: the paper prints a mean of 0.704, the scores in its table give 0.703.",
+        "MLP in Table 3: the paper prints a median of 0.398, the scores in its table give 0.399.",
+    ]
+
+
+def test_the_page_of_last_rows_is_up_to_date():
+    page = pathlib.Path(__file__).parent.parent / "docs" / "results" / "published.md"
+    assert page.read_text(encoding="utf-8") == published_table() + "\n"
+
+
+def test_games_match_in_any_spelling():
+    assert match_games(["bank_heist", "PONG", "Up n Down"], ["BankHeist", "Pong", "UpNDown"]) == {
+        "bank_heist": "BankHeist",
+        "PONG": "Pong",
+        "Up n Down": "UpNDown",
+    }
+    with pytest.raises(ValueError, match="expected each game once, found 'pong' beside another spelling"):
+        match_games(["Pong", "pong"], ["Pong"])
+
+
+def test_runs_are_read(tmp_path):
+    file = tmp_path / "runs.json"
+    file.write_text(json.dumps({"pong": [1, 2.5, 3], "bank heist": [4, 5], "Hero": [6]}))
+    found = read_runs(file, "X", ["BankHeist", "Pong"], others=["Hero", "pong"])
+    assert found.to_numpy().tolist() == [
+        ["X", "BankHeist", 0, 4.0],
+        ["X", "BankHeist", 1, 5.0],
+        ["X", "Pong", 0, 1.0],
+        ["X", "Pong", 1, 2.5],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "reference X: expected a JSON file, found .*x.json"),
+        ("[1]", r"with a raw score per run, found \[1\]. Write one list per game"),
+        ('{"Pong": 3}', "found for Pong 3. Write its runs as a list of finite numbers"),
+        ('{"Pong": [1, NaN]}', "found for Pong"),
+        ('{"Pong": [true]}', "found for Pong"),
+        ('{"Pong": []}', "found for Pong"),
+        ('{"Pong": [1]}', "expected scores for Pong, BankHeist, found none for BankHeist. Add them"),
+        ('{"Pong": [1], "BankHeis": [1]}', r"found 'BankHeis'. Did you mean 'BankHeist'\? Correct the name"),
+    ],
+)
+def test_files_of_runs_that_are_wrong(tmp_path, content, message):
+    file = tmp_path / "x.json"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_runs(file, "X", ["Pong", "BankHeist"])
+    with pytest.raises(ValueError, match=r"expected a JSON file, found .*nowhere"):
+        read_runs(tmp_path / "nowhere", "X", ["Pong"])

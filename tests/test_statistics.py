@@ -5,7 +5,18 @@ import pandas as pd
 import pytest
 from rliable import library, metrics
 
-from sb3_eqr.benchmark.statistics import aggregate, detectable_difference, score_matrices
+from sb3_eqr.benchmark.statistics import (
+    aggregate,
+    average_score_profiles,
+    detectable_difference,
+    games_above,
+    improvement_probabilities,
+    iqm_differences,
+    performance_profiles,
+    probability_of_improvement,
+    sample_efficiency,
+    score_matrices,
+)
 
 
 def table(agent, matrix):
@@ -58,3 +69,60 @@ def test_the_detectable_difference_is_what_resampling_whole_experiments_gives():
     assert detectable_difference(first, second) == pytest.approx(1.96 * spread * np.sqrt(1 + 4), rel=0.15)
     with pytest.raises(ValueError, match="two runs or more of each agent, found 1"):
         detectable_difference(first[:1], second)
+
+
+def test_profiles_by_hand():
+    """Two runs, two games: 3 of 4 scores lie above 0.5, and the mean of one game of two."""
+    matrices = {"a": np.array([[0.0, 0.6], [0.8, 1.0]])}
+    taus = np.array([-1.0, 0.5, 2.0])
+    value, low, high = performance_profiles(matrices, taus, reps=20)["a"]
+    assert value.tolist() == [1, 0.75, 0] and (low <= value).all() and (value <= high).all() and low[1] < high[1]
+    assert average_score_profiles(matrices, taus, reps=20)["a"][0].tolist() == [1, 0.5, 0]
+    _, low, high = performance_profiles({"a": np.ones((1, 2))}, taus, reps=20)["a"]
+    assert np.isnan(low).all() and np.isnan(high).all()
+
+
+def test_profiles_are_those_of_rliable():
+    matrix, taus = np.random.default_rng(0).gamma(1.0, 1.0, (4, 3)), np.linspace(0, 2, 5)
+    np.random.seed(5)
+    values, bands = library.create_performance_profile({"a": matrix}, taus, reps=30)
+    found = performance_profiles({"a": matrix}, taus, reps=30, seed=5)["a"]
+    np.testing.assert_allclose(found, [values["a"], *bands["a"]])
+
+
+def test_probability_of_improvement_is_that_of_rliable():
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 4, (5, 6)) / 1.0, rng.integers(0, 4, (3, 6)) / 1.0  # with ties
+    assert probability_of_improvement(first, second) == pytest.approx(metrics.probability_of_improvement(first, second))
+    assert probability_of_improvement(np.array([[1.0], [3.0]]), np.array([[2.0], [1.0]])) == 2.5 / 4
+    found = improvement_probabilities({"a": second, "b": first}, "a", reps=40, seed=2)
+    np.random.seed(2)
+    _, ends = library.get_interval_estimates(
+        {"b": [first, second]}, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=40
+    )
+    assert found["agent"].tolist() == ["b"] and found["baseline"].tolist() == ["a"]
+    assert found.loc[0, ["low", "high"]].tolist() == pytest.approx(ends["b"][:, 0].tolist())
+    single = improvement_probabilities({"a": second[:1], "b": first}, "a", reps=5)
+    assert single[["low", "high"]].isna().all(axis=None) and improvement_probabilities({"a": first}, "a").empty
+
+
+def test_sample_efficiency_is_an_iqm_per_point():
+    curves = np.random.default_rng(0).gamma(1.0, 1.0, (4, 5, 3))
+    value, low, high = sample_efficiency({"a": curves}, reps=50)["a"]
+    assert value.tolist() == pytest.approx([metrics.aggregate_iqm(curves[..., point]) for point in range(3)])
+    assert (low < value).all() and (value < high).all()
+
+
+def test_games_above_are_counted_by_their_means():
+    assert games_above(np.array([[0.0, 1.0, 3.0], [3.0, 1.0, 0.0]])) == 2
+
+
+def test_differences_of_iqms():
+    first, second = np.array([[0.0], [1.0]]), np.array([[2.0], [2.0], [2.0]])
+    row = iqm_differences({"a": first, "b": second, "c": first[:1]}, "a", reps=100).to_dict("records")
+    assert row[0]["difference"] == pytest.approx(1.5) and (row[0]["runs"], row[0]["baseline_runs"], row[0]["games"]) == (
+        3,
+        2,
+        1,
+    )
+    assert row[0]["detectable"] == detectable_difference(second, first, reps=100) and np.isnan(row[1]["detectable"])

@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -52,15 +53,12 @@ def make_atari100k_env(
         env = gym.make(env_id, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None)
         return _in_agent_steps(env)
 
-    def preprocess(env: gym.Env) -> gym.Env:  # outside Monitor
-        return _for_training(env) if training else WarpFrame(env, width=SCREEN_SIZE, height=SCREEN_SIZE)
-
     env = make_vec_env(
         make_game,
         n_envs=n_envs,
         seed=seed,
         monitor_dir=monitor_dir,
-        wrapper_class=preprocess,
+        wrapper_class=partial(_preprocess, training=training),  # outside Monitor
         vec_env_cls=vec_env_cls,  # type: ignore[arg-type]
         vec_env_kwargs=vec_env_kwargs,
     )
@@ -69,14 +67,15 @@ def make_atari100k_env(
 
 class Atari100kWrapper(gym.Wrapper):
     """
-    The same preprocessing around one ALE environment, in training, for RL Zoo's ``env_wrapper``
-    (with ``frame_stack: 4``). SB3's ``evaluate_policy`` still sees raw scores of whole games, from ``Monitor``.
+    The same preprocessing around one ALE environment, for RL Zoo's ``env_wrapper`` (with ``frame_stack: 4``). SB3's
+    ``evaluate_policy`` still sees raw scores of whole games, from ``Monitor``.
 
     :param env: "PongNoFrameskip-v4", or "ALE/Pong-v5" made with ``frameskip=1, repeat_action_probability=0.0``
+    :param training: False: rewards raw, an episode is a whole game
     :raises ValueError: for an environment that skips frames or repeats actions itself
     """
 
-    def __init__(self, env: gym.Env):
+    def __init__(self, env: gym.Env, training: bool = True):
         made_with = {} if env.spec is None else env.spec.kwargs
         found = {key: made_with.get(key) for key in ("frameskip", "repeat_action_probability")}
         if found != {"frameskip": 1, "repeat_action_probability": 0.0}:
@@ -85,15 +84,16 @@ class Atari100kWrapper(gym.Wrapper):
                 f"{found}. Use the NoFrameskip-v4 name of the game, or RL Zoo's "
                 "--env-kwargs frameskip:1 repeat_action_probability:0.0."
             )
-        super().__init__(_for_training(_in_agent_steps(env)))
+        super().__init__(_preprocess(_in_agent_steps(env), training))
 
 
 def _in_agent_steps(env: gym.Env) -> gym.Env:
     return TimeLimit(MaxAndSkipEnv(NoopResetEnv(env, noop_max=NOOP_MAX), skip=FRAME_SKIP), MAX_STEPS)
 
 
-def _for_training(env: gym.Env) -> gym.Env:
-    return ClipRewardEnv(WarpFrame(EpisodicLifeEnv(env), width=SCREEN_SIZE, height=SCREEN_SIZE))
+def _preprocess(env: gym.Env, training: bool) -> gym.Env:
+    warped = WarpFrame(EpisodicLifeEnv(env) if training else env, width=SCREEN_SIZE, height=SCREEN_SIZE)
+    return ClipRewardEnv(warped) if training else warped
 
 
 def atari_env_id(game: str) -> str:

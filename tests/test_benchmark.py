@@ -1,0 +1,174 @@
+"""The command line of the benchmark, from an empty folder to a report, on Ray."""
+
+import json
+import pathlib
+import sys
+
+import pandas as pd
+import pytest
+import yaml
+
+from sb3_eqr import benchmark, cli
+from sb3_eqr.benchmark.agents import find_agent
+from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of
+from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
+
+FAST = (
+    "{policy: MlpPolicy, n_timesteps: 9, learning_starts: 9, batch_size: 4, buffer_size: 99, policy_kwargs: {net_arch: [8]}}"
+)
+SUITE = {
+    "env_id": "{game}-v1",
+    "games": ["CartPole", "Acrobot"],
+    "steps": 60,
+    "evaluation": {"episodes": 2, "n_envs": 2, "max_steps": 30, "curve": {"points": 2, "episodes": 1}},
+    "normalisation": {"unit": "unit", "source": "test", "scores": {"CartPole": [0, 30], "Acrobot": [-30, 0]}},
+}
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    pathlib.Path("own.yml").write_text(yaml.safe_dump({"tiny": SUITE}))
+    pathlib.Path("fast.yml").write_text(f"CartPole-v1: {FAST}\nAcrobot-v1: {FAST}\n")
+    return tmp_path
+
+
+@pytest.fixture
+def sb3_eqr(monkeypatch, capfd):
+    def call(line):
+        monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", *line.split()])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        return left.value.code, capfd.readouterr()
+
+    return call
+
+
+def test_from_an_empty_folder_to_scores(files, sb3_eqr):
+    line = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml qrdqn:fast.yml"
+    code, out = sb3_eqr(f"{line} --games cartpole --seeds 1")
+    assert code == 0 and "qrdqn:fast, CartPole, seed 0: finished" in out.out
+    before = {path: path.stat().st_mtime for path in files.glob("b/runs/*/*/*/result.json")}
+    code, out = sb3_eqr(f"{line} --seeds 2")  # more seeds, and the other game
+    assert code == 0 and "2 of 8 runs are finished already." in out.out and "CartPole, seed 0: finished" not in out.out
+    results = {path: json.loads(path.read_text()) for path in files.glob("b/runs/*/*/*/result.json")}
+    assert len(results) == 8 and all(path.stat().st_mtime == time for path, time in before.items())
+    assert results[files / "b/runs/dqn-fast/Acrobot/1/result.json"]["command"] == f"sb3-eqr benchmark {line} --seeds 2"
+    code, out = sb3_eqr("status b")
+    rows = [row.split() for row in out.out.splitlines()]
+    assert code == 0 and ["dqn:fast", "4/4", "100%"] in rows and ["all", "8/8", "100%"] in rows
+    scores = benchmark.load_scores("b")
+    assert scores.columns.tolist() == ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
+    counts = scores[scores["kind"] != "training"].groupby(["agent", "game", "seed", "step", "kind"]).size()
+    expected = {(a, g, s): {30: 1, 60: 2} for a in ("dqn:fast", "qrdqn:fast") for g in ("CartPole", "Acrobot") for s in (0, 1)}
+    assert counts.droplevel("kind").to_dict() == {(*run, step): n for run, row in expected.items() for step, n in row.items()}
+    assert read_suite(files / "b" / "suite.yml").games == ["CartPole", "Acrobot"]
+    code, out = sb3_eqr("run b")  # nothing is left
+    assert code == 0 and "8 of 8 runs are finished already." in out.out
+
+
+def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr):
+    broken = FAST.replace("batch_size: 4", "batch_size: 4, max_grad_norm: wrong")
+    pathlib.Path("broken.yml").write_text(f"CartPole-v1: {broken}\n")
+    line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
+    code, out = sb3_eqr(line)
+    assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
+    assert "failed: dqn:broken, CartPole, seed 0:" in out.out
+    code, out = sb3_eqr("status b")
+    assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in out.out
+    pathlib.Path("broken.yml").write_text(pathlib.Path("fast.yml").read_text())
+    code, out = sb3_eqr(line)
+    assert code == 0 and [state_of(run).name for run in read_plan(pathlib.Path("b"))] == ["done", "done"]
+
+
+RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("run b --suite atari10k --agents dqn", "'atari10k' is none. Did you mean 'atari100k'? There are atari100k, atari"),
+        ("run b --suite atari100k --games Pnog --agents dqn", "suite 'atari100k' has no game 'Pnog'. Did you mean 'Pong'?"),
+        ("run b --suite smoke --agents dnq", "'dnq' is no algorithm. Did you mean 'dqn'?"),
+        ("run b --suite smoke --agents eqr_rainbow:se2+ate", "no hyperparameters 'se2+ate'. Did you mean 'se2+aet'?"),
+        ("run b --suite minatar --agents eqr_rainbow:der", "no entry for 'MinAtar/Asterix-v1'"),
+        ("run b --suite smoke --agents dqn dqn", "expected different agents, found dqn more than once"),
+        ("run b --suite smoke", "expected both --suite and --agents, or neither"),
+        ("run b", "found no runs in it"),
+        ("status b", "found no runs in it"),
+        (f"{RUN} --seeds 0", "--seeds: expected at least 1, found 0"),
+        (f"{RUN} --steps 0", "--steps: expected at least 1, found 0"),
+        (f"{RUN} --cpus-per-run 0", "--cpus-per-run"),
+        (f"{RUN} --device cuda:7", "PyTorch finds no GPU"),
+        (f"{RUN} --suite-file other.yml", "there is no file other.yml"),
+        (f"{RUN} --seeds 1 --cpus-per-run 999", "CPUs of the largest machine, found 999"),
+        ("report b --reference x", "--reference: expected NAME=FILE, found 'x'"),
+    ],
+)
+def test_wrong_use_is_told(files, sb3_eqr, line, message):
+    code, out = sb3_eqr(line)
+    assert code == 2 and message in out.err and "Traceback" not in out.err
+
+
+def test_other_settings_do_not_go_into_the_same_folder(files):
+    suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
+    benchmark_plan = plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
+    from sb3_eqr.benchmark.plan import write_plan
+
+    write_plan(files / "b", suite, benchmark_plan)
+    with pytest.raises(ValueError, match="expected steps 70, found a run with 60"):
+        plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)
+    with pytest.raises(ValueError, match="expected a benchmark of suite 'smoke', found one of 'tiny'"):
+        write_plan(files / "b", load_suite("smoke"), [])
+
+
+def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    code, out = sb3_eqr(RUN)
+    assert code == 2 and 'benchmark run needs Ray: pip install "sb3-eqr[benchmark]"' in out.err
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"step": 1}, "unknown key 'step'. Did you mean 'steps'"),
+        ({"steps": {"CartPole": 10}}, "expected steps for every game, found none for Acrobot"),
+        ({"steps": 0}, "expected whole numbers above 0, found 0"),
+        ({"evaluation": {"episodes": 1, "n_envs": 1}}, "found no curve"),
+        ({"normalisation": {"unit": "x"}}, "found no scores, source"),
+        ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
+    ],
+)
+def test_suites_with_mistakes_are_told(files, change, message):
+    (files / "own.yml").write_text(yaml.safe_dump({"tiny": {**SUITE, **change}}))
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        choose(load_suite("tiny", files / "own.yml"), None, None)
+
+
+def test_our_suites(tmp_path):
+    atari = load_suite("atari100k")
+    reference = benchmark.load_reference()
+    assert {game.lower() for game in atari.games} == set(reference["game"]) and set(atari.steps.values()) == {100_000}
+    assert atari.normalisation["scores"]["Pong"] == [-20.7, 14.6]  # the paper's Table 2
+    assert load_suite("atari100k-5").games == ["Assault", "BattleZone", "Boxing", "ChopperCommand", "Qbert"]
+    for name in ("atari100k", "atari100k-5", "minatar", "classic", "smoke"):
+        suite = choose(load_suite(name), None, None)
+        assert suite.normalisation["scores"].keys() == set(suite.games), name
+        assert all(high > low for low, high in suite.normalisation["scores"].values())
+        write_suite(suite, tmp_path / "suite.yml")
+        assert read_suite(tmp_path / "suite.yml") == suite
+    evaluation = atari.evaluation
+    assert (evaluation["episodes"], evaluation["epsilon"], evaluation["max_steps"]) == (100, 0.001, 27_000)
+
+
+def test_agents_and_their_files():
+    assert find_agent("qrdqn").file.name == "qrdqn.yml" and "rl_zoo3" in str(find_agent("qrdqn").file)
+    assert find_agent("qrdqn:stock").file.parent.name == "stock"
+    assert find_agent("eqr_rainbow").file.parent.name == "zoo_hyperparams"
+    assert find_agent("eqr_rainbow:se2+aet").file.name == "se2+aet.yml"  # and not se2+aet+r
+    assert find_agent("eqr_rainbow:mlp").name == "eqr_rainbow:mlp+aet+r"
+
+
+def test_scores_without_runs(tmp_path):
+    assert isinstance(benchmark.load_scores(tmp_path), pd.DataFrame) and benchmark.load_scores(tmp_path).empty
