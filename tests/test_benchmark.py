@@ -7,6 +7,7 @@ import sys
 import pandas as pd
 import pytest
 import yaml
+from ray.cluster_utils import Cluster
 
 from sb3_eqr import benchmark, cli
 from sb3_eqr.benchmark.agents import find_agent
@@ -34,6 +35,14 @@ def files(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a Ray cluster: a machine of one CPU."""
+    started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    yield started.address
+    started.shutdown()
+
+
 @pytest.fixture
 def sb3_eqr(monkeypatch, capfd):
     def call(line):
@@ -45,16 +54,16 @@ def sb3_eqr(monkeypatch, capfd):
     return call
 
 
-def test_from_an_empty_folder_to_scores(files, sb3_eqr):
+def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     line = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml qrdqn:fast.yml"
     code, out = sb3_eqr(f"{line} --games cartpole --seeds 1")
     assert code == 0 and "qrdqn:fast, CartPole, seed 0: finished" in out.out
     before = {path: path.stat().st_mtime for path in files.glob("b/runs/*/*/*/result.json")}
-    code, out = sb3_eqr(f"{line} --seeds 2")  # more seeds, and the other game
+    code, out = sb3_eqr(f"{line} --seeds 2 --address {cluster}")  # more seeds, and the other game
     assert code == 0 and "2 of 8 runs are finished already." in out.out and "CartPole, seed 0: finished" not in out.out
     results = {path: json.loads(path.read_text()) for path in files.glob("b/runs/*/*/*/result.json")}
     assert len(results) == 8 and all(path.stat().st_mtime == time for path, time in before.items())
-    assert results[files / "b/runs/dqn-fast/Acrobot/1/result.json"]["command"] == f"sb3-eqr benchmark {line} --seeds 2"
+    assert results[files / "b/runs/dqn-fast/Acrobot/1/result.json"]["command"].startswith(f"sb3-eqr benchmark {line}")
     code, out = sb3_eqr("status b")
     rows = [row.split() for row in out.out.splitlines()]
     assert code == 0 and ["dqn:fast", "4/4", "100%"] in rows and ["all", "8/8", "100%"] in rows
@@ -68,10 +77,11 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr):
     assert code == 0 and "8 of 8 runs are finished already." in out.out
 
 
-def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr):
+def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr, cluster):
     broken = FAST.replace("batch_size: 4", "batch_size: 4, max_grad_norm: wrong")
     pathlib.Path("broken.yml").write_text(f"CartPole-v1: {broken}\n")
     line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
+    line += f" --address {cluster}"
     code, out = sb3_eqr(line)
     assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
     assert "failed: dqn:broken, CartPole, seed 0:" in out.out
@@ -102,13 +112,19 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         (f"{RUN} --cpus-per-run 0", "--cpus-per-run"),
         (f"{RUN} --device cuda:7", "PyTorch finds no GPU"),
         (f"{RUN} --suite-file other.yml", "there is no file other.yml"),
-        (f"{RUN} --seeds 1 --cpus-per-run 999", "CPUs of the largest machine, found 999"),
         ("report b --reference x", "--reference: expected NAME=FILE, found 'x'"),
     ],
 )
 def test_wrong_use_is_told(files, sb3_eqr, line, message):
     code, out = sb3_eqr(line)
     assert code == 2 and message in out.err and "Traceback" not in out.err
+
+
+def test_runs_that_no_machine_can_hold_are_told(files, sb3_eqr, cluster):
+    code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --address {cluster}")
+    assert code == 2 and "--cpus-per-run: expected at most the 1 CPUs of the largest machine, found 2" in out.err
+    code, out = sb3_eqr(f"{RUN} --seeds 1 --address 127.0.0.1:1")
+    assert code == 2 and "127.0.0.1:1" in out.err
 
 
 def test_other_settings_do_not_go_into_the_same_folder(files):

@@ -76,7 +76,7 @@ def test_a_stopped_run_ends_with_the_scores_of_an_undisturbed_one(algo, tmp_path
     undisturbed = make_run(tmp_path / "undisturbed", algo)
     assert execute(undisturbed, Settings()) == "finished"
     stopped = make_run(tmp_path / "stopped", algo)
-    often = Settings(checkpoint_seconds=0.0)
+    often = Settings(checkpoint_seconds=0.05)
     stop_at(monkeypatch, 150, 310)
     for _ in range(2):
         with pytest.raises(KeyError, match="stopped at"):

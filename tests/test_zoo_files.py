@@ -20,10 +20,11 @@ ENVIRONMENTS = {
     "BlindCliffwalk-v0",
     *(f"MinAtar/{game}-v1" for game in GAMES),
 }
-CASES = [
+ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
+CASES = [  # what stands for several environments is one object of YAML, and built once
     (name, env_id)
-    for name, path in configuration_files().items()
-    for env_id in yaml.safe_load(path.read_text(encoding="utf-8"))
+    for name, entries in ENTRIES.items()
+    for env_id in {id(entry): env_id for env_id, entry in entries.items()}.values()
 ]
 
 
@@ -32,12 +33,11 @@ def algorithm_of(name):
 
 
 def test_every_file_has_its_environments():
-    found = {}
-    for name, env_id in CASES:
-        found.setdefault(name, set()).add(env_id)
     full = {"eqr_qrdqn", "eqr_rainbow", "stock/dqn", "stock/qrdqn"}
-    assert {name for name, entries in found.items() if entries == ENVIRONMENTS} == full
-    assert all(entries == {"atari"} for name, entries in found.items() if name not in full)
+    assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS} == full
+    minatar = {"atari", *(env_id for env_id in ENVIRONMENTS if env_id.startswith("MinAtar/"))}
+    assert ENTRIES["rainbow"].keys() == minatar and len({id(ENTRIES["rainbow"][env_id]) for env_id in minatar}) == 2
+    assert all(entries.keys() == {"atari"} for name, entries in ENTRIES.items() if name not in {*full, "rainbow"})
 
 
 @pytest.mark.parametrize("name, entry", CASES, ids=lambda value: value)

@@ -14,6 +14,13 @@ from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.zoo.checks import check_machine, fail
 
 
+def absolute(path: str) -> pathlib.Path:
+    """
+    :return: the path as every machine of a cluster understands it
+    """
+    return pathlib.Path(path).resolve()
+
+
 def make_parser() -> argparse.ArgumentParser:
     """
     :return: of the three commands
@@ -21,7 +28,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents, with evidence.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command goes on where it stopped")
-    run.add_argument("folder", type=pathlib.Path, help="where everything is written")
+    run.add_argument("folder", type=absolute, help="where everything is written")
     run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, or one of --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
     run.add_argument("--agents", nargs="+", help="ALGO or ALGO:ENTRIES, such as qrdqn, qrdqn:stock, eqr_rainbow:se2+aet")

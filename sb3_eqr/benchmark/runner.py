@@ -3,6 +3,7 @@
 import datetime
 import logging
 import os
+import socket
 import time
 from collections import Counter, deque
 from typing import Any
@@ -54,11 +55,27 @@ def start_ray(address: str | None) -> Any:
         import ray
     except ImportError as error:
         raise ImportError('benchmark run needs Ray: pip install "sb3-eqr[benchmark]"') from error
+    check_address(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # says Ray's own warning
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray's own warning asks for
     local: dict[str, Any] = {} if address else {"include_dashboard": False}
     ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
     return ray
+
+
+def check_address(address: str | None) -> None:
+    """
+    :raises ConnectionError: if nothing answers at HOST:PORT, for which Ray would wait minutes and then end the process
+    """
+    host, _, port = (address or "").rpartition(":")
+    if not host or not port.isdigit() or "/" in host:
+        return  # none, "auto", or another form of Ray's
+    try:
+        socket.create_connection((host, int(port)), timeout=5).close()
+    except OSError as error:
+        raise ConnectionError(
+            f"--address: no Ray cluster answers at {address} ({error}). Start one: ray start --head"
+        ) from error
 
 
 def run_benchmark(

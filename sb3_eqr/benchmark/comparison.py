@@ -1,0 +1,187 @@
+"""From benchmark folders to what can be compared: the games that all agents have, their runs in common, one protocol."""
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from sb3_eqr.benchmark.reference import load_reference, nearest, plain_game, read_runs
+from sb3_eqr.benchmark.scores import load_results, score_table
+from sb3_eqr.benchmark.selection import choose_runs, protocol_differences
+from sb3_eqr.benchmark.suites import Suite, read_suite
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """
+    :param suite: name of the suite, of several ones with "+"
+    :param unit: of normalised scores
+    :param source: of the bounds that scores are normalised by
+    :param bounds: game -> (score that becomes 0, score that becomes 1)
+    :param games: that every agent has runs on, in the suite's order
+    :param agents: of the benchmark; the first is the one that the others are held against
+    :param references: methods whose runs were read from a file
+    :param scores: columns agent, game, seed, raw, score (normalised); the runs that are compared, agents and references
+    :param results: result.json of those runs
+    :param episodes: every episode of every finished run, as ``score_table`` gives them
+    :param differing: agent -> how its protocol differs from the others', where the comparison was forced
+    :param notes: sentences on what was left out and why
+    """
+
+    suite: str
+    unit: str
+    source: str
+    bounds: dict[str, tuple[float, float]]
+    games: list[str]
+    agents: list[str]
+    references: list[str]
+    scores: pd.DataFrame
+    results: list[dict[str, Any]]
+    episodes: pd.DataFrame
+    differing: dict[str, str]
+    notes: list[str]
+
+    @property
+    def human(self) -> bool:
+        """Whether 1 is human play on Atari, so that published scores can stand beside."""
+        return self.unit.startswith("human-normali")
+
+    def runs(self, agent: str) -> int:
+        """:return: how many runs per game are compared"""
+        return int(self.scores[self.scores["agent"] == agent]["seed"].nunique())
+
+    def normalize(self, game: str, raw: Any) -> Any:
+        """
+        :param game: one of ``games``
+        :param raw: score or array of scores
+        :return: the same, normalised
+        """
+        return normalize(raw, self.bounds[game])
+
+
+def normalize(raw: Any, bounds: tuple[float, float]) -> Any:
+    """
+    :param raw: score or array of scores
+    :param bounds: the score that becomes 0, the score that becomes 1
+    """
+    low, high = bounds
+    return (raw - low) / (high - low)
+
+
+def compare(folders: list[pathlib.Path], references: Mapping[str, pathlib.Path], force: bool) -> Comparison:
+    """
+    :param folders: of benchmarks
+    :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.reference.read_runs`
+    :param force: compare agents with different protocols, too
+    :return: what the folders have in common
+    :raises ValueError: if that is nothing, or if comparing it would mislead
+    """
+    if not folders:
+        raise ValueError("report: expected one benchmark folder or more, found none")
+    suites = [_read_suite(folder) for folder in folders]
+    results = _load(folders)
+    bounds = _bounds(suites, results)
+    games, chosen, notes = choose_runs(results, list(dict.fromkeys(game for suite in suites for game in suite.games)))
+    agents = sorted(chosen, key=lambda agent: (agent.startswith("eqr_"), agent))
+    used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
+    differing = protocol_differences(used)
+    if differing and not force:
+        told = " ".join(f"{agent}: {what}." for agent, what in differing.items())
+        raise ValueError(
+            f"protocol: expected the same for every run of a game, found {told} "
+            "Report these agents apart, or pass --force to mark them in every table."
+        )
+    episodes = score_table(results)
+    runs = [(result["agent"], result["game"], result["seed"]) for result in used]
+    scores = [_final_scores(episodes[pd.MultiIndex.from_frame(episodes[["agent", "game", "seed"]]).isin(runs)])]
+    known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
+    for name, path in references.items():
+        if name in agents:
+            raise ValueError(f"reference {name}: expected a name that no agent has, found the agent {name}. Rename it.")
+        scores.append(read_runs(path, name, games, known).rename(columns={"score": "raw"}))
+    order = [*agents, *references]
+    table = pd.concat(scores, ignore_index=True).sort_values("agent", key=lambda names: names.map(order.index), kind="stable")
+    table["score"] = [normalize(raw, bounds[game]) for game, raw in zip(table["game"], table["raw"], strict=True)]
+    return Comparison(
+        suite=" + ".join(dict.fromkeys(suite.name for suite in suites)),
+        unit=suites[0].normalisation["unit"],
+        source=suites[0].normalisation["source"],
+        bounds=bounds,
+        games=games,
+        agents=agents,
+        references=list(references),
+        scores=table.reset_index(drop=True),
+        results=sorted(used, key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"])),
+        episodes=episodes,
+        differing=differing,
+        notes=notes,
+    )
+
+
+def _read_suite(folder: pathlib.Path) -> Suite:
+    path = pathlib.Path(folder) / "suite.yml"
+    if not path.is_file():
+        raise ValueError(f"{folder}: expected a folder of sb3-eqr benchmark run, with suite.yml in it, found none")
+    return read_suite(path)
+
+
+def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
+    """
+    :raises ValueError: for a folder without finished runs, and for a run that is in two folders
+    """
+    results: list[dict[str, Any]] = []
+    where: dict[tuple, pathlib.Path] = {}
+    for folder in map(pathlib.Path, folders):
+        found = load_results(folder)
+        if not found:
+            raise ValueError(f"{folder}: expected finished runs, found none. Run sb3-eqr benchmark run first.")
+        for result in found:
+            run = (result["agent"], result["game"], result["seed"])
+            if run in where:
+                raise ValueError(
+                    f"{run[0]}, {run[1]}, seed {run[2]}: expected each run once, found it in {where[run]} and {folder}. "
+                    "Report one of the folders."
+                )
+            if not any(evaluation["kind"] == "final" and evaluation["scores"] for evaluation in result["evaluations"]):
+                raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]}: expected a final evaluation, found none")
+            where[run] = folder
+        results += found
+    return results
+
+
+def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """
+    :return: game -> (score that becomes 0, score that becomes 1)
+    :raises ValueError: where a game has none, or folders do not agree on them
+    """
+    bounds: dict[str, tuple[float, float]] = {}
+    for suite in suites:
+        if suite.normalisation["unit"] != suites[0].normalisation["unit"]:
+            raise ValueError(
+                f"normalisation: expected one unit, found {suites[0].normalisation['unit']!r} in {suites[0].name} and "
+                f"{suite.normalisation['unit']!r} in {suite.name}. Report them apart."
+            )
+        for game, (low, high) in suite.normalisation["scores"].items():
+            if low == high or bounds.setdefault(game, (low, high)) != (low, high):
+                raise ValueError(
+                    f"normalisation of {game}: expected two bounds, the same in all folders, found {low} and {high} in "
+                    f"{suite.name} and {bounds.get(game)} before. Correct suite.yml."
+                )
+    for game in dict.fromkeys(result["game"] for result in results):
+        if game not in bounds:
+            raise ValueError(
+                f"{game}: expected a game that {suites[0].name} has bounds to normalise for ({', '.join(bounds) or 'none'}), "
+                f"found none for it.{nearest(game, {plain_game(known): known for known in bounds})} "
+                "Correct the name, or add the game under normalisation: scores in suite.yml."
+            )
+    return bounds
+
+
+def _final_scores(episodes: pd.DataFrame) -> pd.DataFrame:
+    """
+    :return: columns agent, game, seed, raw: the mean score over the episodes of the final evaluation
+    """
+    final = episodes[episodes["kind"] == "final"]
+    return final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()

@@ -1,0 +1,399 @@
+"""From result.json files to the numbers, words and files of a report."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from rliable import library, metrics
+
+from sb3_eqr.benchmark import figures, sections
+from sb3_eqr.benchmark.analysis import analyse, difference_in_words
+from sb3_eqr.benchmark.comparison import compare
+from sb3_eqr.benchmark.curves import normalized_curves, on_common_steps, symmetry_losses
+from sb3_eqr.benchmark.figures import looks
+from sb3_eqr.benchmark.pictures import all_pictures
+from sb3_eqr.benchmark.reference import SHOWN, published_means
+from sb3_eqr.benchmark.report import write_report
+from sb3_eqr.benchmark.suites import Suite, write_suite
+from sb3_eqr.benchmark.tables import Cell, Table, number, to_latex, to_markdown
+
+PONG, BOXING, KRULL = [-20.7, 14.6], [0.1, 12.1], [1598.0, 2665.5]  # Table 2: random, human
+SUITE = Suite(
+    name="small",
+    games=["Pong", "Boxing", "Krull"],
+    env_id="{game}NoFrameskip-v4",
+    steps={"Pong": 100_000, "Boxing": 100_000, "Krull": 100_000},
+    preprocessing={"frame_stack": 4},
+    evaluation={"episodes": 2, "n_envs": 2, "epsilon": 0.001, "max_steps": 27_000, "curve": {"points": 2, "episodes": 2}},
+    normalisation={
+        "unit": "human-normalised score",
+        "source": "EqR paper, Table 2",
+        "scores": {"Pong": PONG, "Boxing": BOXING, "Krull": KRULL},
+    },
+)
+FULL, BASE = "eqr_rainbow:se2+aet+r", "eqr_rainbow:se2+aet"
+SCORES = {  # agent -> game -> final score of each seed; the mean of two episodes
+    "dqn": {"Pong": [-20.7, -18.7, -19.7], "Boxing": [0.1, 2.1, 1.1], "Krull": [1598.0, 1798.0, 1998.0]},
+    BASE: {"Pong": [-10.0, -12.0, -14.0], "Boxing": [10.0, 12.0, 14.0], "Krull": [3000.0, 3200.0, 2800.0]},
+    FULL: {"Pong": [-9.0, -11.0, -13.0], "Boxing": [9.0, 12.0, 15.0], "Krull": [3100.0, 3300.0, 2700.0]},
+}
+
+
+def a_result(agent, game, seed, score):
+    losses = [{"step": step, "td_loss": 1.0, "aet_loss": 0.5, "get_loss": 0.25} for step in (4_000, 8_000)]
+    return {
+        "agent": agent,
+        "game": game,
+        "seed": seed,
+        "suite": SUITE.name,
+        "protocol": SUITE.protocol(game),
+        "entry": {"algo": agent, "file": "a", "name": "atari", "hyperparameters": {"batch_size": 32}},
+        "versions": {"torch": "2.9"},
+        "machine": {"device": "cpu", "threads": 1, "platform": "Linux"},
+        "command": f"sb3-eqr benchmark run small --agents {agent}",
+        "started": "2026-11-21T15:00:00+00:00",
+        "wall_clock_s": 1_800.0,
+        "steps_per_second": 55.5,
+        "attempts": 1,
+        "resumed_at": [],
+        "evaluations": [
+            {"step": 50_000, "kind": "curve", "scores": [score / 2, score / 2], "lengths": [7, 7]},
+            {"step": 100_000, "kind": "curve", "scores": [999.0], "lengths": [7]},  # the final one counts instead
+            {"step": 100_000, "kind": "final", "scores": [score - 1, score + 1], "lengths": [8, 8]},
+        ],
+        "training": {"step": [10], "score": [3.0], "length": [10]},
+        "losses": losses if agent.startswith("eqr") else [],
+    }
+
+
+def a_benchmark(folder, scores=SCORES, suite=SUITE, change=lambda result: result):
+    folder.mkdir(parents=True)
+    write_suite(suite, folder / "suite.yml")
+    for agent, games in scores.items():
+        for game, values in games.items():
+            for seed, value in enumerate(values):
+                path = folder / "runs" / agent / game / str(seed) / "result.json"
+                result = change(a_result(agent, game, seed, value))
+                if result is not None:
+                    path.parent.mkdir(parents=True)
+                    path.write_text(json.dumps(result))
+    return folder
+
+
+def matrix(agent, scores=SCORES):
+    """(runs, games), human-normalised, without any of our code."""
+    bounds = {"Pong": PONG, "Boxing": BOXING, "Krull": KRULL}
+    rows = [[(v - bounds[g][0]) / (bounds[g][1] - bounds[g][0]) for v in values] for g, values in scores[agent].items()]
+    return np.array(rows).T
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "DPI", 60)
+        return write_report([a_benchmark(folder / "runs")], {}, False, folder / "report", reps=50)
+
+
+@pytest.fixture
+def not_drawn(monkeypatch):
+    """The figures take most of the time, and are drawn whole for :func:`report`."""
+    monkeypatch.setattr(sections, "draw", lambda pictures: ("", {}))
+
+
+def text_of(page):
+    return re.sub(r"\s+", " ", re.sub("<wbr>", "", page.read_text(encoding="utf-8")))
+
+
+def test_the_numbers_are_those_of_rliable(report):
+    """From result.json to aggregates.csv, against rliable called here on scores normalised here."""
+    found = pd.read_csv(report.with_name("aggregates.csv"), keep_default_na=False, na_values=[""])
+    for agent in SCORES:
+        rows = found[found["agent"] == agent].set_index("metric")
+        functions = {
+            "IQM": metrics.aggregate_iqm,
+            "median": metrics.aggregate_median,
+            "mean": metrics.aggregate_mean,
+            "optimality gap": metrics.aggregate_optimality_gap,
+        }
+        for name, function in functions.items():
+            assert rows.at[name, "value"] == pytest.approx(function(matrix(agent)))
+        np.random.seed(0)
+        ordered = matrix(agent)[:, [1, 2, 0]]  # the bootstrap draws for the games in alphabetical order
+        _, ends = library.get_interval_estimates({"": ordered}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=50)
+        assert rows.loc["IQM", ["low", "high"]].tolist() == pytest.approx(ends[""][:, 0].tolist())
+        assert rows.at["superhuman games", "value"] == (matrix(agent).mean(axis=0) > 1).sum()
+        assert (rows["runs"] == 3).all() and (rows["games"] == 3).all() and (rows["from"] == "runs").all()
+
+
+def test_published_methods_join_as_means_of_the_games_present(report):
+    found = pd.read_csv(report.with_name("aggregates.csv")).query("agent == 'EqR, R + GET (paper)'").set_index("metric")
+    values = [(-6.1 + 20.7) / 35.3, (39.2 - 0.1) / 12.0, (5467.7 - 1598) / 1067.5]  # Table 2
+    assert found.at["mean", "value"] == pytest.approx(np.mean(values))
+    assert found.at["median", "value"] == pytest.approx(sorted(values)[1])
+    assert found.at["superhuman games", "value"] == 2 and (found["from"] == "game means only").all()
+    assert found[["low", "high"]].isna().all(axis=None)
+    page = text_of(report)
+    assert "† EqR, R + GET (paper): game means only (10 runs), no interval. EqR paper (ICML 2022), Table 2." in page
+    assert "† SPR: game means only (100 runs), no interval." in page and "CURL" not in page.partition("Published last rows")[0]
+
+
+def test_the_table_of_games(report):
+    page = text_of(report)
+    assert '<th scope="row">Boxing</th>' in page
+    assert "<b>3,033</b> <small>± 306</small>" in page  # Krull: 3100, 3300, 2700; sd with n - 1
+    assert "<td>3,000 <small>± 200</small></td>" in page
+    assert "<b>−11.0</b> <small>± 2.0</small>" in page and "<td>−12.0 <small>± 2.0</small></td>" in page
+    assert page.count("<b>12.0</b>") == 2  # a tie
+    line = next(line for line in report.with_name("table.md").read_text().splitlines() if line.startswith("| Krull"))
+    assert line.startswith("| Krull | 1,598 | 2,666 | 1,798 ± 200 | 3,000 ± 200 | **3,033** ± 306 |")
+    gaps = next(line for line in report.with_name("table.md").read_text().splitlines() if line.startswith("| optimality gap"))
+    smallest = min(metrics.aggregate_optimality_gap(matrix(agent)) for agent in SCORES)
+    assert re.findall(r"\*\*(.*?)\*\*", gaps) == [f"{smallest:.3f}"]
+    tex = report.with_name("table.tex").read_text()
+    assert r"eqr\_rainbow:se2+aet+r" in tex and r"\textbf{3,033} {\scriptsize $\pm$ 306}" in tex
+    assert "eqr_rainbow" not in "".join(line for line in tex.splitlines(keepends=True) if not line.startswith("%"))
+
+
+def test_the_files_are_whole(report):
+    names = {path.name for path in report.parent.iterdir()}
+    names_of_figures = {"profiles", "aggregates", "improvement", "sample_efficiency", "learning_curves", "symmetry_losses"}
+    names_of_figures |= {"loss_components_eqr_rainbow"}  # two of them; of the groups there is but one
+    assert {path.stem for path in report.parent.glob("*.png")} == names_of_figures
+    data = {"report.html", "table.md", "table.tex", "scores.csv", "scores.parquet", "aggregates.csv"}
+    assert names == data | {f"{name}.png" for name in names_of_figures}
+    for path in report.parent.glob("*.png"):
+        assert path.read_bytes().startswith(b"\x89PNG") and path.read_bytes().endswith(b"IEND\xaeB`\x82")
+    scores = pd.read_csv(report.with_name("scores.csv"))
+    assert len(scores) == 27 * (2 + 1 + 2 + 1) and set(scores["kind"]) == {"curve", "final", "training"}
+    pd.testing.assert_frame_equal(scores, pd.read_parquet(report.with_name("scores.parquet")))
+
+
+def test_the_page_needs_nothing_from_elsewhere(report):
+    page = report.read_text(encoding="utf-8")
+    assert page.startswith("<!DOCTYPE html>") and page.endswith("</html>\n")
+    assert not re.search(r"<script|<link|@import|url\(|https?:", page)
+    assert all(
+        target.startswith(("data:image/png;base64,", "#")) for target in re.findall(r'(?:src|srcset|href)="(.{22})', page)
+    )
+    assert page.count("<figure>") == 7 and page.count("<img") == 7 and page.count("<source media") == 7
+    assert set(re.findall(r'href="#(\w+)"', page)) == set(re.findall(r'id="(\w+)"', page))
+    assert page.count('<div class="box"') == page.count("<table") + page.count("<pre>")  # all that is wide scrolls by itself
+    assert 'name="viewport"' in page and "Before the numbers" not in page  # nothing to warn of
+
+
+def test_the_page_says_how_to_repeat_it(report):
+    page = text_of(report)
+    assert page.count("sb3-eqr benchmark run small --agents dqn") == 1
+    assert "Linux" in page and "55.5" in page and "0.50" in page and "batch_size" in page
+    assert "0.058 with 1 seed, 0.026 with 5 seeds, 0.018 with 10 seeds" in page
+    assert "SPR in Table 2: the paper prints a mean of 0.704, the scores in its table give 0.703." in page
+
+
+def test_differences_in_words(tmp_path):
+    analysis = analyse(compare([a_benchmark(tmp_path / "a")], {}, False), reps=200)
+    rows = analysis.differences.to_dict("records")
+    pairs = {(row["agent"], row["baseline"]) for row in rows}
+    assert analysis.baseline == "dqn" and pairs >= {(BASE, "dqn"), (FULL, "dqn")} and len(pairs) == 3
+    words = [difference_in_words(row, analysis.comparison) for row in rows]
+    far = metrics.aggregate_iqm(matrix(BASE)) - metrics.aggregate_iqm(matrix("dqn"))
+    assert words[0].startswith(f"{BASE} lies {far:.2f} above dqn: 3 runs on 3 games show differences from ")
+    near = metrics.aggregate_iqm(matrix(BASE)) - metrics.aggregate_iqm(matrix(FULL))
+    assert "cannot be told apart" in words[-1] and f"the difference is {abs(near):.2f}, 3 runs on 3 games" in words[-1]
+
+
+def with_steps(agent, steps):
+    def change(result):
+        if result["agent"] == agent:
+            result["protocol"]["steps"] = steps
+        return result
+
+    return change
+
+
+def test_another_protocol_is_refused_or_marked(tmp_path, not_drawn):
+    folder = a_benchmark(tmp_path / "a", change=with_steps(BASE, 50_000))
+    text = f"found {BASE}: steps is 50000, not 100000 (Boxing, Krull, Pong). Report these agents apart, or pass --force"
+    with pytest.raises(ValueError, match=re.escape(text)):
+        write_report([folder], {}, False, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+    page = write_report([folder], {}, True, tmp_path / "report", reps=5)
+    text = text_of(page)
+    assert f"‡ {BASE} was run under another protocol: steps is 50000, not 100000" in text
+    assert text.count(f">{BASE} ‡</th>") >= 4 and f"{FULL} ‡" not in text  # summary, games, runs, settings
+    assert "se2+aet ‡ |" in page.with_name("table.md").read_text()
+    assert r"se2+aet \ddag{} &" in page.with_name("table.tex").read_text()
+    rows = pd.read_csv(page.with_name("aggregates.csv")).dropna(subset="protocol_differs")
+    assert set(rows["agent"]) == {BASE} and rows["protocol_differs"].str.startswith("steps is 50000").all()
+
+
+def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
+    def change(result):
+        run = (result["agent"], result["game"], result["seed"])
+        return None if run[:2] == ("dqn", "Krull") or run == (FULL, "Pong", 1) else result
+
+    suite = dataclasses.replace(
+        SUITE, games=[*SUITE.games, "Hero"], normalisation=SUITE.normalisation, steps={**SUITE.steps, "Hero": 100_000}
+    )
+    page = write_report([a_benchmark(tmp_path / "a", suite=suite, change=change)], {}, False, tmp_path / "report", reps=5)
+    text = text_of(page)
+    assert "No finished run of any agent: Hero." in text and "dqn has no finished run on Krull." in text
+    assert "Compared are the 2 of 4 games that every agent has: Pong, Boxing." in text
+    assert f"{FULL} has not all seeds on every game: Pong lacks 1. Compared are its seeds 0, 2" in text
+    rows = pd.read_csv(page.with_name("aggregates.csv")).set_index(["agent", "metric"])
+    kept = matrix(FULL)[[0, 2], :2]
+    assert rows.at[(FULL, "mean"), "value"] == pytest.approx(kept.mean()) and rows.at[(FULL, "mean"), "runs"] == 2
+    assert rows.at[("dqn", "mean"), "value"] == pytest.approx(matrix("dqn")[:, :2].mean())
+
+
+def test_nothing_to_compare(tmp_path):
+    apart = {"dqn": {"Pong": [1.0]}, "qrdqn": {"Krull": [1.0]}}
+    with pytest.raises(ValueError, match=r"found none: dqn has Pong; qrdqn has Krull. Report fewer agents"):
+        compare([a_benchmark(tmp_path / "a", apart)], {}, False)
+
+    def change(result):
+        return result if (result["game"] == "Pong") == (result["seed"] == 0) else None
+
+    with pytest.raises(ValueError, match="dqn: expected a seed that it has on every game, found none: Pong: 0; Boxing: 1, 2"):
+        compare([a_benchmark(tmp_path / "b", {"dqn": SCORES["dqn"]}, change=change)], {}, False)
+    with pytest.raises(ValueError, match=r"c: expected finished runs, found none. Run sb3-eqr benchmark run first"):
+        compare([a_benchmark(tmp_path / "c", {})], {}, False)
+    with pytest.raises(ValueError, match=r"nowhere: expected a folder of sb3-eqr benchmark run, with suite.yml in it"):
+        compare([tmp_path / "nowhere"], {}, False)
+    with pytest.raises(ValueError, match="expected one benchmark folder or more"):
+        compare([], {}, False)
+
+
+def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
+    with pytest.raises(ValueError, match=r"Boxng: expected a game .* \(Pong, Boxing, Krull\).* Did you mean 'Boxing'\?"):
+        compare([a_benchmark(tmp_path / "a", {"dqn": {"Pong": [1.0]}}, change=lambda r: r | {"game": "Boxng"})], {}, False)
+
+    one = {"dqn": {"Pong": [1.0]}}
+    folders = [a_benchmark(tmp_path / "b", one), a_benchmark(tmp_path / "c", one)]
+    with pytest.raises(ValueError, match=r"dqn, Pong, seed 0: expected each run once, found it in .*b and .*c"):
+        compare(folders, {}, False)
+    other = dataclasses.replace(SUITE, normalisation={**SUITE.normalisation, "scores": {"Pong": [0.0, 1.0]}})
+    later = a_benchmark(tmp_path / "d", {"qrdqn": {"Pong": [1.0]}}, suite=other)
+    with pytest.raises(
+        ValueError, match=r"normalisation of Pong: expected two bounds, the same in all folders, found 0.0 and 1"
+    ):
+        compare([folders[0], later], {}, False)
+
+
+def test_two_folders_are_one_benchmark(tmp_path):
+    first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]})
+    second = a_benchmark(tmp_path / "b", {FULL: SCORES[FULL]})
+    found = compare([second, first], {}, False)
+    assert found.agents == ["dqn", FULL] and found.games == SUITE.games and found.notes == []
+
+
+def test_one_agent_one_game_one_seed(tmp_path, not_drawn):
+    folder = a_benchmark(tmp_path / "a", {FULL: {"Pong": [0.0]}})
+    page = write_report([folder], {}, False, tmp_path / "report", reps=5)
+    text = text_of(page)
+    assert f"{FULL} has a single run per game: no intervals" in text and "What the runs can show" not in text
+    rows = pd.read_csv(page.with_name("aggregates.csv")).query(f"agent == '{FULL}'").set_index("metric")
+    assert rows.at["IQM", "value"] == pytest.approx(20.7 / 35.3) and rows[["low", "high"]].isna().all(axis=None)
+    assert "<b>" not in text.partition("Published last rows")[0]
+    found = all_pictures(analyse(compare([folder], {}, False), 5))
+    assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves", "symmetry_losses"]
+    assert "95%" not in "".join(p.caption for p in found)
+    assert found[-1].caption.endswith("A single run each.") and len(found[0].draw(1).axes) == 2
+
+
+def test_without_pyarrow_the_parquet_file_is_skipped(tmp_path, not_drawn, monkeypatch):
+    def missing(self, *args, **kwargs):
+        raise ImportError("pyarrow")
+
+    monkeypatch.setattr(pd.DataFrame, "to_parquet", missing)
+    page = write_report([a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]})], {}, False, tmp_path / "report", reps=5)
+    assert "scores.parquet was left out: it needs pyarrow" in text_of(page)
+    assert not page.with_name("scores.parquet").exists() and page.with_name("scores.csv").exists()
+
+
+def test_other_units_stand_without_published_scores(tmp_path, not_drawn):
+    suite = dataclasses.replace(SUITE, normalisation={**SUITE.normalisation, "unit": "random play 0, solved 1"})
+    text = text_of(write_report([a_benchmark(tmp_path / "a", suite=suite)], {}, False, tmp_path / "report", reps=5))
+    assert "games above 1" in text and "superhuman" not in text and "SPR" not in text and "†" not in text
+
+
+def test_a_reference_of_runs_joins_with_intervals(tmp_path, not_drawn):
+    file = tmp_path / "theirs.json"
+    file.write_text(json.dumps({"pong": [0.0, 1.0], "BOXING": [5.0, 6.0], "kr_ull": [2000, 2100], "Hero": [1.0]}))
+    page = write_report([a_benchmark(tmp_path / "a")], {"THEIRS": file}, False, tmp_path / "report", reps=20)
+    rows = pd.read_csv(page.with_name("aggregates.csv")).query("agent == 'THEIRS'").set_index("metric")
+    scores = matrix("T", {"T": {"Pong": [0.0, 1.0], "Boxing": [5.0, 6.0], "Krull": [2000, 2100]}})
+    assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 2
+    assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
+    assert "THEIRS lies" in text_of(page) and "2 and 3 runs on 3 games" in text_of(page)
+    with pytest.raises(ValueError, match="reference dqn: expected a name that no agent has"):
+        compare([tmp_path / "a"], {"dqn": file}, False)
+
+
+def test_curves_are_shares_of_the_steps_and_end_with_the_final_evaluation(tmp_path):
+    def change(result):
+        if result["game"] == "Krull":  # twice as long as the others
+            result["protocol"]["steps"] = 200_000
+            for evaluation in result["evaluations"]:
+                evaluation["step"] *= 2
+        return result
+
+    comparison = compare([a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]}, change=change)], {}, False)
+    fractions, curves = normalized_curves(comparison)
+    assert fractions[FULL].tolist() == [0.5, 1.0] and curves[FULL].shape == (3, 3, 2)
+    assert curves[FULL][..., -1] == pytest.approx(matrix(FULL))
+    assert curves[FULL][0, 0, 0] == pytest.approx((-4.5 + 20.7) / 35.3)  # Pong, seed 0, half way
+    steps, values = symmetry_losses(comparison)["Pong"][FULL]
+    assert steps.tolist() == [4_000, 8_000] and (values == 0.75).all() and len(values) == 3
+
+
+def test_losses_logged_at_other_steps_are_interpolated():
+    long = (np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0]))
+    short = (np.array([5, 25]), np.array([1.0, 5.0]))
+    steps, values = on_common_steps([long, short])
+    assert steps.tolist() == [5, 25] and values.tolist() == [[0.5, 2.5], [1.0, 5.0]]
+
+
+def test_figures_without_anything_to_show_are_left_out(tmp_path):
+    def change(result):
+        return result | {"losses": [], "evaluations": result["evaluations"][-1:]}
+
+    found = all_pictures(analyse(compare([a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]}, change=change)], {}, False), 5))
+    assert [picture.name for picture in found] == ["profiles", "aggregates"]
+
+
+def test_the_ablations_of_groups_have_their_figure(tmp_path):
+    scores = {"eqr_qrdqn:mlp+aet+r": SCORES["dqn"], "eqr_qrdqn:gl2+aet+r": SCORES[FULL], FULL: SCORES[FULL]}
+    found = {p.name for p in all_pictures(analyse(compare([a_benchmark(tmp_path / "a", scores)], {}, False), 5))}
+    assert "groups_eqr_qrdqn" in found and not {"groups_eqr_rainbow", "loss_components_eqr_rainbow"} & found
+
+
+def test_agents_differ_without_colours():
+    style = looks([str(i) for i in range(66)])
+    assert len({(look.line, look.marker) for look in style.values()}) == 66
+
+
+def test_cells_are_escaped():
+    table = Table(["a_b", "50% & more"], [[Cell("x|y"), Cell("1", bold=True, aside="± 2")]])
+    assert to_markdown(table) == "| a\\_b | 50% & more |\n|---|---:|\n| x\\|y | **1** ± 2 |\n"
+    assert r"a\_b & 50\% \& more \\" in to_latex(table) and r"x\textbar{}y & \textbf{1} {\scriptsize $\pm$ 2} \\" in to_latex(
+        table
+    )
+    html_of = sections.page("<t>", "a & b", ["<note>"], [("<h>", sections.bullets(["<x>"]))])
+    assert "<title>&lt;t&gt;</title>" in html_of and "<li>&lt;note&gt;</li>" in html_of and "<x>" not in html_of
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "text"),
+    [(52118.4, None, "52,118"), (-20.7, None, "−20.7"), (0.123, None, "0.12"), (-0.0001, 2, "0.00"), (np.nan, None, "–")],
+)
+def test_numbers(value, decimals, text):
+    assert number(value, decimals) == text
+
+
+def test_published_means_have_the_names_of_the_suite():
+    means = published_means(SHOWN, ["Bank_Heist", "Tetris", "Pong"])
+    assert means.index.tolist() == ["Bank_Heist", "Pong"] and means.at["Pong", "EqR, R (paper)"] == -6.0
