@@ -35,7 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--games", nargs="+", help="some games of the suite (default: all)")
     run.add_argument("--seeds", type=int, default=5, help="number of seeds, from 0 (default: 5)")
     run.add_argument("--steps", type=int, help="training steps instead of the suite's")
-    run.add_argument("--device", default="auto", help="of PyTorch (default: auto)")
+    run.add_argument("--device", default="auto", help="of PyTorch (default: the GPU with --gpus-per-run, else cpu)")
     run.add_argument("--address", help="of a Ray cluster that sees the folder (default: this machine)")
     run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs, and threads of PyTorch, of a run (default: 1)")
     run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs of a run, such as 0.1 (default: 0)")
@@ -55,7 +55,11 @@ def run(args: argparse.Namespace) -> int:
     :param args: of ``run``
     :return: exit status: 1 if a run failed
     """
-    check_machine(args.device, False, "")
+    device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
+    if args.address is None:  # else the machines of the cluster count
+        check_machine(device, False, "")
+    if device.startswith("cuda") and args.gpus_per_run == 0:
+        raise ValueError(f"--device {device}: expected --gpus-per-run above 0, such as 0.1 for ten runs on a GPU")
     if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
         raise ValueError(
             f"--cpus-per-run, --gpus-per-run: expected > 0 and >= 0, found {args.cpus_per_run} and {args.gpus_per_run}"
@@ -71,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         runs = plan_runs(args.folder, suite, args.agents, args.seeds)
         write_plan(args.folder, suite, runs)
     command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
-    settings = Settings(command, args.device, max(int(args.cpus_per_run), 1), args.checkpoint_every)
+    settings = Settings(command, device, max(int(args.cpus_per_run), 1), args.checkpoint_every)
     console = Console()
     failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
     for run_ in failed:

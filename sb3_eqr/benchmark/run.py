@@ -328,9 +328,11 @@ def execute(run: Run, settings: Settings) -> str:
             th.set_num_threads(settings.n_threads)
             try:
                 train(run, settings)
-            except (Exception, SystemExit):
+            except (Exception, SystemExit) as error:
                 with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
                     file.write(traceback.format_exc().encode())
+                if isinstance(error, SystemExit):  # would end Ray's worker, too
+                    raise RuntimeError(f"{run.agent.file}: cannot be used (exit {error.code})") from error
                 raise
             for name in (ERROR, PROGRESS):
                 (run.folder / name).unlink(missing_ok=True)
