@@ -1,5 +1,6 @@
 """Checkpoints of a run: everything that training goes on from, in a folder that appears whole or not at all."""
 
+import io
 import os
 import pathlib
 import pickle
@@ -28,20 +29,51 @@ def environment_chain(env: VecEnv) -> list[VecEnv]:
     return chain
 
 
+class StatePickler(cloudpickle.Pickler):
+    """
+    Pickles environments in the state that they are in. Some would come back as new ones (``EzPickle``): ALE's are given their
+    state, others cannot be pickled.
+    """
+
+    def reducer_override(self, obj: Any) -> Any:
+        """As ``pickle.Pickler``'s."""
+        if not isinstance(obj, EzPickle):
+            return super().reducer_override(obj)
+        if not hasattr(obj, "ale"):
+            raise pickle.PicklingError(f"{type(obj).__name__} has no way to save its state")
+        rest = {name: value for name, value in vars(obj).items() if name != "ale"}
+        made_by = type(obj), obj._ezpickle_args, obj._ezpickle_kwargs
+        return restore_game, (*made_by, obj.ale.cloneSystemState(), rest)
+
+
+def restore_game(game_class: Any, args: Any, kwargs: Any, state: Any, rest: dict[str, Any]) -> Any:
+    """
+    :param game_class: of ALE's environment
+    :param args: that it was made with
+    :param kwargs: that it was made with
+    :param state: of the emulator
+    :param rest: all other attributes
+    """
+    game = game_class(*args, **kwargs)
+    game.ale.restoreSystemState(state)
+    vars(game).update(rest)
+    return game
+
+
 def pickle_environment(env: VecEnv) -> bytes | None:
     """
-    :return: the state of all environments and wrappers; ``None`` if an environment cannot be pickled in its state, as ALE and
-        Box2D, which pickle as new ones (``EzPickle``)
+    :return: the state of all environments and wrappers; ``None`` if one of them cannot be pickled in its state, as Box2D
     """
     chain = environment_chain(env)
-    games = chain[-1]
-    if not isinstance(games, DummyVecEnv) or any(isinstance(game.unwrapped, EzPickle) for game in games.envs):
+    if not isinstance(chain[-1], DummyVecEnv):
         return None
     states = [{k: v for k, v in vars(link).items() if k not in ("venv", "class_attributes")} for link in chain]
+    buffer = io.BytesIO()
     try:
-        return cloudpickle.dumps(states)
+        StatePickler(buffer).dump(states)
     except (TypeError, pickle.PicklingError):
         return None
+    return buffer.getvalue()
 
 
 def write_checkpoint(folder: pathlib.Path, model: BaseAlgorithm, record: dict[str, Any], is_final: bool = False) -> None:
