@@ -7,7 +7,7 @@ CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
 
-.PHONY: demo test pytest format lint type commit-checks clean
+.PHONY: demo test pytest slow format lint type commit-checks clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -21,6 +21,9 @@ test: lint type pytest
 
 pytest: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2
+
+slow: $(VENV)/installed
+	$(BIN)/python -m pytest -m slow
 
 format: $(VENV)/installed
 	$(BIN)/ruff check --select I --fix .

@@ -71,6 +71,7 @@ def test_readme_example_runs(tmp_path, monkeypatch):
     assert (tmp_path / "pong.zip").exists()
 
 
+@pytest.mark.slow
 def test_speed_script_prints_its_table(tmp_path):
     command = [sys.executable, "-m", "sb3_eqr.benchmark.speed", "--threads", "1", "--rounds", "1"]
     shown = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout

@@ -247,6 +247,7 @@ def run_sb3_eqr(line, folder, **environment):
     )
 
 
+@pytest.mark.slow
 def test_two_processes_search_on_one_journal(tmp_path):
     """Trials are shared, none is lost, none made twice."""
     line = "train --algo eqr_qrdqn --env CartPole-v1 -n 120 -params learning_starts:100 -optimize --max-total-trials 6 "
@@ -261,6 +262,7 @@ def test_two_processes_search_on_one_journal(tmp_path):
     assert len(trials) >= 6 and sorted(told) == list(range(len(trials)))  # each once, in one of the two
 
 
+@pytest.mark.slow
 def test_weights_and_biases_offline(tmp_path):
     pytest.importorskip("wandb")
     line = "train --algo eqr_qrdqn --env CartPole-v1 -n 1100 --eval-freq -1 --track --wandb-project-name eqr -f logs"
