@@ -3,15 +3,20 @@
 import json
 import pathlib
 import sys
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 import yaml
 from ray.cluster_utils import Cluster
+from ray.exceptions import RayError
+from rich.console import Console
 
 from sb3_eqr import benchmark, cli
+from sb3_eqr.benchmark import runner
 from sb3_eqr.benchmark.agents import find_agent
-from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of
+from sb3_eqr.benchmark.plan import State, plan_runs, read_plan, state_of, write_plan
+from sb3_eqr.benchmark.run import Settings
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 
 FAST = (
@@ -85,6 +90,7 @@ def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(f
     code, out = sb3_eqr(line)
     assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
     assert "failed: dqn:broken, CartPole, seed 0:" in out.out
+    assert json.loads(pathlib.Path("b/runs/dqn-fast/CartPole/0/result.json").read_text())["attempts"] == 1
     code, out = sb3_eqr("status b")
     assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in out.out
     pathlib.Path("broken.yml").write_text(pathlib.Path("fast.yml").read_text())
@@ -101,7 +107,10 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite atari10k --agents dqn", "'atari10k' is none. Did you mean 'atari100k'? There are atari100k, atari"),
         ("run b --suite atari100k --games Pnog --agents dqn", "suite 'atari100k' has no game 'Pnog'. Did you mean 'Pong'?"),
         ("run b --suite smoke --agents dnq", "'dnq' is no algorithm. Did you mean 'dqn'?"),
-        ("run b --suite smoke --agents eqr_rainbow:se2+ate", "no hyperparameters 'se2+ate'. Did you mean 'se2+aet'?"),
+        ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no such hyperparameters. There are"),
+        ("run b --suite smoke --agents sac", "expected a game that sac can play, found discrete actions"),
+        ("run b --suite smoke --agents ppo --steps 2001", "in whole rounds of its 8 environments, found 2001 steps"),
+        ("run b --suite smoke --agents eqr_rainbow:se2+ate", "there are no such hyperparameters. Did you mean 'se2+aet'?"),
         ("run b --suite minatar --agents eqr_rainbow:der", "no entry for 'MinAtar/Asterix-v1'"),
         ("run b --suite smoke --agents dqn dqn", "expected different agents, found dqn more than once"),
         ("run b --suite smoke", "expected both --suite and --agents, or neither"),
@@ -130,11 +139,14 @@ def test_runs_that_no_machine_can_hold_are_told(files, sb3_eqr, cluster):
 def test_other_settings_do_not_go_into_the_same_folder(files):
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
     benchmark_plan = plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
-    from sb3_eqr.benchmark.plan import write_plan
-
     write_plan(files / "b", suite, benchmark_plan)
+    plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)  # nothing has begun yet
+    (benchmark_plan[0].folder / "result.json").write_text("{}")
     with pytest.raises(ValueError, match="expected steps 70, found a run with 60"):
         plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)
+    (files / "fast.yml").write_text(f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 8')}")
+    with pytest.raises(ValueError, match=r"expected hyperparameters.batch_size 8, found a run with 4"):
+        plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
     with pytest.raises(ValueError, match="expected a benchmark of suite 'smoke', found one of 'tiny'"):
         write_plan(files / "b", load_suite("smoke"), [])
 
@@ -153,13 +165,77 @@ def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
         ({"steps": 0}, "expected whole numbers above 0, found 0"),
         ({"evaluation": {"episodes": 1, "n_envs": 1}}, "found no curve"),
         ({"normalisation": {"unit": "x"}}, "found no scores, source"),
+        ({"games": "CartPole"}, "games: expected a list, found 'CartPole'"),
+        ({"env_id": "CartPole-v1"}, "expected {game} in it, found 'CartPole-v1'"),
+        ({"evaluation": None}, "evaluation: expected keys and values, found None"),
+        ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "n_envs: expected a whole number of at least 1, found 0"),
+        ({"evaluation": {**SUITE["evaluation"], "epsilon": 7}}, r"epsilon: expected a finite number in \[0, 1\], found 7"),
+        ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "found none for CartPole, Acrobot"),
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
 )
 def test_suites_with_mistakes_are_told(files, change, message):
     (files / "own.yml").write_text(yaml.safe_dump({"tiny": {**SUITE, **change}}))
-    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+    with pytest.raises(ValueError, match=message):
         choose(load_suite("tiny", files / "own.yml"), None, None)
+
+
+@pytest.mark.parametrize(
+    "preprocessing, message",
+    [
+        ({}, "expected evaluation on whole games with raw scores, found no preprocessing"),
+        ({"env_wrapper": "sb3_eqr.envs.atari.Atari100kWrapper"}, "raw scores, found ClipRewardEnv, EpisodicLifeEnv"),
+        (
+            {"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}]},
+            "found an entry with its own frame_stack",
+        ),
+    ],
+)
+def test_atari_suites_that_do_not_see_whole_games_or_the_same_game_are_told(files, preprocessing, message):
+    entry = {
+        **SUITE,
+        "env_id": "{game}NoFrameskip-v4",
+        "games": ["Pong"],
+        "preprocessing": preprocessing,
+        "normalisation": "human",
+    }
+    (files / "own.yml").write_text(yaml.safe_dump({"tiny": entry}))
+    suite = choose(load_suite("tiny", files / "own.yml"), None, None)
+    with pytest.raises(ValueError, match=message):
+        plan_runs(files / "b", suite, ["qrdqn:stock"], 1)
+
+
+def test_a_replay_buffer_is_no_larger_than_the_run(files):
+    """QRDQN's own default is 1,000,000: 56 GB of Atari's frames."""
+    suite = choose(load_suite("smoke"), None, None)
+    runs = plan_runs(files / "b", suite, ["qrdqn", "eqr_qrdqn", "dqn:fast.yml", "ppo"], 1)
+    assert [run.entry.get("buffer_size") for run in runs] == [3_000, 3_000, 99, None]
+
+
+class Crash(RayError):
+    def __init__(self, cause):
+        self.cause = cause
+
+
+@pytest.mark.parametrize("cause", [AssertionError(), ValueError("[/tmp/x] [cpu]\nthe [last] line"), None])
+def test_a_crash_without_words_or_with_brackets_does_not_stop_the_others(files, cause, capsys, monkeypatch):
+    """Nor a disk that is too full for the error itself."""
+    runs = plan_runs(files / "b", choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None), ["dqn:fast.yml"], 1)
+
+    def get(reference):
+        raise Crash(cause)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(runner, "atomic_write", full)
+    fake = SimpleNamespace(get=get, exceptions=SimpleNamespace(RayError=RayError))
+    task = SimpleNamespace(remote=lambda run, settings: "second")
+    dispatcher = runner.Dispatcher(fake, task, runs, [State("waiting", 0, 0.0)], Settings(), Console())
+    dispatcher.running = {"first": 0}
+    dispatcher.take_in("first")
+    dispatcher.take_in("second")
+    assert dispatcher.failed == [0] and capsys.readouterr().out.count("dqn:fast, CartPole, seed 0: crashed (") == 2
 
 
 def test_our_suites(tmp_path):

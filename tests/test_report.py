@@ -137,8 +137,13 @@ def test_published_methods_join_as_means_of_the_games_present(report):
     assert found.at["superhuman games", "value"] == 2 and (found["from"] == "game means only").all()
     assert found[["low", "high"]].isna().all(axis=None)
     page = text_of(report)
-    assert "† EqR, R + GET (paper): game means only (10 runs), no interval. EqR paper (ICML 2022), Table 2." in page
-    assert "† SPR: game means only (100 runs), no interval." in page and "CURL" not in page.partition("Published last rows")[0]
+    assert (
+        "† EqR, R + GET (paper): 100K steps, game means only (10 runs), no interval. EqR paper (ICML 2022), Table 2." in page
+    )
+    assert (
+        "† SPR: 100K steps, game means only (100 runs), no interval." in page
+        and "CURL" not in page.partition("Published last rows")[0]
+    )
 
 
 def test_the_table_of_games(report):
@@ -216,7 +221,7 @@ def with_steps(agent, steps):
 
 def test_another_protocol_is_refused_or_marked(tmp_path, not_drawn):
     folder = a_benchmark(tmp_path / "a", change=with_steps(BASE, 50_000))
-    text = f"found {BASE}: steps is 50000, not 100000 (Boxing, Krull, Pong). Report these agents apart, or pass --force"
+    text = f"found {BASE}: steps is 50000, not 100000 (Boxing, Krull, Pong). Choose with --agents, or pass --force"
     with pytest.raises(ValueError, match=re.escape(text)):
         write_report([folder], {}, False, tmp_path / "report")
     assert not (tmp_path / "report").exists()
@@ -238,7 +243,12 @@ def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
     suite = dataclasses.replace(
         SUITE, games=[*SUITE.games, "Hero"], normalisation=SUITE.normalisation, steps={**SUITE.steps, "Hero": 100_000}
     )
-    page = write_report([a_benchmark(tmp_path / "a", suite=suite, change=change)], {}, False, tmp_path / "report", reps=5)
+    folder = a_benchmark(tmp_path / "a", suite=suite, change=change)
+    with pytest.raises(
+        ValueError, match=r"found some missing. No finished run of any agent: Hero. dqn has no finished run on K"
+    ):
+        write_report([folder], {}, False, tmp_path / "report")
+    page = write_report([folder], {}, True, tmp_path / "report", reps=5)
     text = text_of(page)
     assert "No finished run of any agent: Hero." in text and "dqn has no finished run on Krull." in text
     assert "Compared are the 2 of 4 games that every agent has: Pong, Boxing." in text
@@ -251,7 +261,7 @@ def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
 
 def test_nothing_to_compare(tmp_path):
     apart = {"dqn": {"Pong": [1.0]}, "qrdqn": {"Krull": [1.0]}}
-    with pytest.raises(ValueError, match=r"found none: dqn has Pong; qrdqn has Krull. Report fewer agents"):
+    with pytest.raises(ValueError, match=r"found none: dqn has Pong; qrdqn has Krull. Choose some with --agents"):
         compare([a_benchmark(tmp_path / "a", apart)], {}, False)
 
     def change(result):
@@ -283,6 +293,37 @@ def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
         compare([folders[0], later], {}, False)
 
 
+def test_agents_and_baseline_are_chosen(tmp_path):
+    folder = a_benchmark(tmp_path / "a")
+    assert compare([folder], {}, False, baseline=FULL).agents == [FULL, "dqn", BASE]
+    assert compare([folder], {}, False, [BASE], FULL).agents == [FULL, BASE]
+    with pytest.raises(ValueError, match=r"--agents: expected some of dqn, eqr_rainbow:se2\+aet, .*, found ppo"):
+        compare([folder], {}, False, ["ppo"])
+    with pytest.raises(ValueError, match=r"--baseline: expected one of dqn, eqr.*, found 'ppo'"):
+        compare([folder], {}, False, baseline="ppo")
+
+
+def test_published_scores_stand_beside_runs_of_their_steps_only(tmp_path, not_drawn):
+    def change(result):
+        result["protocol"]["steps"] = 10_000
+        return result
+
+    text = text_of(write_report([a_benchmark(tmp_path / "a", change=change)], {}, False, tmp_path / "report", reps=5))
+    assert "Published scores are of 100,000 training steps, these are not" in text
+    assert "†" not in text and "superhuman games" in text
+
+
+def test_runs_of_other_hyperparameters_are_told(tmp_path):
+    def change(result):
+        if (result["agent"], result["seed"]) == (BASE, 2):
+            result["entry"]["hyperparameters"]["batch_size"] = 64
+        return result
+
+    assert compare([a_benchmark(tmp_path / "a", change=change)], {}, False).notes == [
+        f"{BASE}: its runs do not all have the same batch_size."
+    ]
+
+
 def test_two_folders_are_one_benchmark(tmp_path):
     first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]})
     second = a_benchmark(tmp_path / "b", {FULL: SCORES[FULL]})
@@ -292,13 +333,13 @@ def test_two_folders_are_one_benchmark(tmp_path):
 
 def test_one_agent_one_game_one_seed(tmp_path, not_drawn):
     folder = a_benchmark(tmp_path / "a", {FULL: {"Pong": [0.0]}})
-    page = write_report([folder], {}, False, tmp_path / "report", reps=5)
+    page = write_report([folder], {}, True, tmp_path / "report", reps=5)
     text = text_of(page)
     assert f"{FULL} has a single run per game: no intervals" in text and "What the runs can show" not in text
     rows = pd.read_csv(page.with_name("aggregates.csv")).query(f"agent == '{FULL}'").set_index("metric")
     assert rows.at["IQM", "value"] == pytest.approx(20.7 / 35.3) and rows[["low", "high"]].isna().all(axis=None)
     assert "<b>" not in text.partition("Published last rows")[0]
-    found = all_pictures(analyse(compare([folder], {}, False), 5))
+    found = all_pictures(analyse(compare([folder], {}, True), 5))
     assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves", "symmetry_losses"]
     assert "95%" not in "".join(p.caption for p in found)
     assert found[-1].caption.endswith("A single run each.") and len(found[0].draw(1).axes) == 2
@@ -328,6 +369,7 @@ def test_a_reference_of_runs_joins_with_intervals(tmp_path, not_drawn):
     scores = matrix("T", {"T": {"Pong": [0.0, 1.0], "Boxing": [5.0, 6.0], "Krull": [2000, 2100]}})
     assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 2
     assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
+    assert "THEIRS: its first 2 runs, as many as Krull has" not in text_of(page)
     assert "THEIRS lies" in text_of(page) and "2 and 3 runs on 3 games" in text_of(page)
     with pytest.raises(ValueError, match="reference dqn: expected a name that no agent has"):
         compare([tmp_path / "a"], {"dqn": file}, False)

@@ -71,6 +71,18 @@ def test_the_detectable_difference_is_what_resampling_whole_experiments_gives():
         detectable_difference(first[:1], second)
 
 
+@pytest.mark.parametrize("n_runs, n_games", [(2, 1), (3, 3), (5, 3)])
+def test_agents_that_are_alike_are_seldom_told_apart(n_runs, n_games):
+    """At most one time in twenty, within three standard deviations of 200 trials."""
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=n_games)
+    apart = 0
+    for _ in range(200):
+        first, second = rng.normal(means, 1, (2, n_runs, n_games))
+        apart += abs(metrics.aggregate_iqm(first) - metrics.aggregate_iqm(second)) > detectable_difference(first, second, 50)
+    assert apart / 200 < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 200)
+
+
 def test_profiles_by_hand():
     """Two runs, two games: 3 of 4 scores lie above 0.5, and the mean of one game of two."""
     matrices = {"a": np.array([[0.0, 0.6], [0.8, 1.0]])}

@@ -45,7 +45,11 @@ def make_parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help="scores, tables, figures and report.html")
     report.add_argument("folders", nargs="+", type=pathlib.Path, metavar="folder", help="of a benchmark, or of several")
     report.add_argument("--reference", action="append", default=[], metavar="NAME=FILE", help="JSON: game -> scores of runs")
-    report.add_argument("--force", action="store_true", help="put agents of different protocols into one table, and mark them")
+    report.add_argument("--agents", nargs="+", default=[], help="some of the agents (default: all)")
+    report.add_argument("--baseline", help="the agent that the others are held against (default: the first stock one)")
+    report.add_argument(
+        "--force", action="store_true", help="compare in spite of other protocols or missing games; it is marked"
+    )
     report.add_argument("--output", type=pathlib.Path, help="where it is written (default: FOLDER/report)")
     return parser
 
@@ -79,11 +83,11 @@ def run(args: argparse.Namespace) -> int:
     console = Console()
     failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
     for run_ in failed:
-        console.print(f"failed: {run_.agent.name}, {run_.game}, seed {run_.seed}: {run_.folder / ERROR}", style="bold")
+        print(f"failed: {run_.agent.name}, {run_.game}, seed {run_.seed}: {run_.folder / ERROR}")
     if failed:
-        console.print("The same command tries them again, from their last checkpoints.")
+        print("The same command tries them again, from their last checkpoints.")
     else:
-        console.print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
+        print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
     return 1 if failed else 0
 
 
@@ -94,12 +98,11 @@ def status(args: argparse.Namespace) -> int:
     """
     runs = read_plan(args.folder)
     states = [state_of(run) for run in runs]
-    console = Console()
-    console.print(make_table(runs, states))
+    Console().print(make_table(runs, states))
     for run, state in zip(runs, states, strict=True):
         if state.name == "failed":
             reason = (run.folder / ERROR).read_text(encoding="utf-8").strip().splitlines()[-1]
-            console.print(f"failed: {run.agent.name}, {run.game}, seed {run.seed}: {reason}")
+            print(f"failed: {run.agent.name}, {run.game}, seed {run.seed}: {reason}")
     return 0
 
 
@@ -117,7 +120,8 @@ def report(args: argparse.Namespace) -> int:
             raise ValueError(f"--reference: expected NAME=FILE, found {text!r}")
         references[name] = pathlib.Path(path)
     output = args.output or args.folders[0] / "report"
-    print(f"Written: {write_report(args.folders, references, args.force, output)}")
+    path = write_report(args.folders, references, args.force, output, args.agents, args.baseline)
+    print(f"Written: {path}")
     return 0
 
 

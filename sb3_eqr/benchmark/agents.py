@@ -1,15 +1,21 @@
 """Agents of a benchmark by name: an algorithm of RL Zoo and the file of hyperparameters that it uses."""
 
+import inspect
 import pathlib
 from typing import Any, NamedTuple
 
 import rl_zoo3
+from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
 from sb3_eqr.benchmark.suites import nearest
 from sb3_eqr.configurations import STOCK, configuration_files
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.entries import check_entry, read_entry
+from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
+
+WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change what is played
+CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms that take no discrete actions
+DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that take no others
 
 
 class Agent(NamedTuple):
@@ -47,18 +53,37 @@ def find_agent(text: str) -> Agent:
     if name not in files and len(longer) == 1:
         entries = name = longer[0]
     if name not in files:
-        raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest(entries, [*legal, STOCK])}")
+        legal += [STOCK] if f"{STOCK}/{algo}" in files else []
+        raise ValueError(f"--agents: {text!r}: there are no such hyperparameters.{nearest(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
 
 
-def hyperparameters(agent: Agent, protocol: dict[str, Any]) -> dict[str, Any]:
+def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:
     """
-    The agent's entry for the game, checked; leaves with a message if there is none or it has a mistake.
+    The agent's entry for a game, checked; leaves with a message if there is none or it has a mistake.
 
     :param agent: the agent
     :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`; its preprocessing stands before the entry's
+    :param action_space: of the game
+    :return: the entry as it is written, with the steps, and no larger replay buffer than these can fill
+    :raises ValueError: if the agent cannot play this game, or plays another one than the suite says
     """
-    changes = {**protocol["preprocessing"], "n_timesteps": protocol["steps"]}
-    entry = read_entry(str(agent.file), protocol["env_id"], changes)
-    check_entry(entry, agent.algo, str(agent.file))
+    steps, env_id, preprocessing = protocol["steps"], protocol["env_id"], protocol["preprocessing"]
+    changes = {**preprocessing, "n_timesteps": steps}
+    entry = find_entry(str(agent.file), env_id, changes)
+    check_entry(read_entry(str(agent.file), env_id, changes), agent.algo, str(agent.file))
+    where = f"{agent.name}, {env_id}"
+    if own := [key for key in WORLD if entry.get(key) is not None and key not in preprocessing]:
+        raise ValueError(
+            f"{where}: expected the suite's game, found an entry with its own {', '.join(own)}. "
+            "All agents must play the same: name it under preprocessing in the suite (null for none)."
+        )
+    kind = "discrete" if isinstance(action_space, spaces.Discrete) else "continuous"
+    if agent.algo in (CONTINUOUS if kind == "discrete" else DISCRETE):
+        raise ValueError(f"{where}: expected a game that {agent.algo} can play, found {kind} actions. Leave the agent out.")
+    if steps % entry.get("n_envs", 1):
+        raise ValueError(f"{where}: expected steps in whole rounds of its {entry['n_envs']} environments, found {steps} steps")
+    default = inspect.signature(ALGOS[agent.algo]).parameters.get("buffer_size")
+    if default is not None:
+        entry["buffer_size"] = min(entry.get("buffer_size", default.default), max(steps, 1_000))
     return entry

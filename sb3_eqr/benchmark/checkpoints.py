@@ -60,20 +60,31 @@ def restore_game(game_class: Any, args: Any, kwargs: Any, state: Any, rest: dict
     return game
 
 
-def pickle_environment(env: VecEnv) -> bytes | None:
+def pickle_environment(env: VecEnv) -> list[bytes | None]:
     """
-    :return: the state of all environments and wrappers; ``None`` if one of them cannot be pickled in its state, as Box2D
+    :return: the state of each link of the chain; ``None`` for what cannot be pickled in its state, as Box2D
     """
-    chain = environment_chain(env)
-    if not isinstance(chain[-1], DummyVecEnv):
-        return None
-    states = [{k: v for k, v in vars(link).items() if k not in ("venv", "class_attributes")} for link in chain]
-    buffer = io.BytesIO()
-    try:
-        StatePickler(buffer).dump(states)
-    except (TypeError, pickle.PicklingError):
-        return None
-    return buffer.getvalue()
+    states: list[bytes | None] = []
+    for link in environment_chain(env):
+        buffer = io.BytesIO()
+        try:
+            if not isinstance(link, (DummyVecEnv, VecEnvWrapper)):
+                raise pickle.PicklingError("environments in other processes")
+            StatePickler(buffer).dump({k: v for k, v in vars(link).items() if k not in ("venv", "class_attributes")})
+            states.append(buffer.getvalue())
+        except (TypeError, ValueError, AttributeError, RuntimeError, pickle.PicklingError):
+            states.append(None)
+    return states
+
+
+def restore_environment(env: VecEnv, states: list[bytes | None]) -> None:
+    """
+    :param env: built as the one before
+    :param states: of :func:`pickle_environment`
+    """
+    for link, state in zip(environment_chain(env), states, strict=True):
+        if state is not None:
+            vars(link).update(cloudpickle.loads(state))
 
 
 def write_checkpoint(folder: pathlib.Path, model: BaseAlgorithm, record: dict[str, Any], is_final: bool = False) -> None:
@@ -124,7 +135,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     :return: the agent that goes on, what was measured so far, and whether it goes on bit for bit; if not, from a fresh episode
     """
     state = cloudpickle.loads((checkpoint / "state.pkl").read_bytes())
-    is_exact = state["environment"] is not None
+    is_exact = None not in state["environment"] and not hasattr(model, "_last_lstm_states")  # which SB3 does not save
     env = model.get_env()
     assert env is not None
     model = type(model).load(checkpoint / "model.zip", env=env, device=model.device, force_reset=not is_exact)
@@ -135,10 +146,8 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
             buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
     env = model.get_env()
     assert env is not None
-    if is_exact:
-        for link, values in zip(environment_chain(env), cloudpickle.loads(state["environment"]), strict=True):
-            vars(link).update(values)
-    else:
+    restore_environment(env, state["environment"] if is_exact else [*state["environment"][:-1], None])
+    if not is_exact:
         env.seed((model.seed or 0) + model.num_timesteps)  # other episodes than at the start
     set_rng_state(state["rng"], model.action_space)
     return model, state["record"], is_exact

@@ -2,14 +2,14 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 
-from sb3_eqr.benchmark.reference import load_reference, nearest, plain_game, read_runs
+from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game, read_runs
 from sb3_eqr.benchmark.scores import load_results, score_table
-from sb3_eqr.benchmark.selection import choose_runs, protocol_differences
+from sb3_eqr.benchmark.selection import choose_runs, protocol_differences, settings_differences
 from sb3_eqr.benchmark.suites import Suite, read_suite
 
 
@@ -48,6 +48,11 @@ class Comparison:
         """Whether 1 is human play on Atari, so that published scores can stand beside."""
         return self.unit.startswith("human-normali")
 
+    @property
+    def steps(self) -> set[int]:
+        """Training steps of the runs that are compared."""
+        return {result["protocol"]["steps"] for result in self.results}
+
     def runs(self, agent: str) -> int:
         """:return: how many runs per game are compared"""
         return int(self.scores[self.scores["agent"] == agent]["seed"].nunique())
@@ -70,40 +75,58 @@ def normalize(raw: Any, bounds: tuple[float, float]) -> Any:
     return (raw - low) / (high - low)
 
 
-def compare(folders: list[pathlib.Path], references: Mapping[str, pathlib.Path], force: bool) -> Comparison:
+def compare(
+    folders: list[pathlib.Path],
+    references: Mapping[str, pathlib.Path],
+    force: bool,
+    agents: Sequence[str] = (),
+    baseline: str | None = None,
+) -> Comparison:
     """
     :param folders: of benchmarks
     :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.reference.read_runs`
-    :param force: compare agents with different protocols, too
+    :param force: compare agents with different protocols or games, too
+    :param agents: those to compare; none: all
+    :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first
     :return: what the folders have in common
     :raises ValueError: if that is nothing, or if comparing it would mislead
     """
     if not folders:
         raise ValueError("report: expected one benchmark folder or more, found none")
     suites = [_read_suite(folder) for folder in folders]
-    results = _load(folders)
+    results = _of_agents(_load(folders), [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
-    games, chosen, notes = choose_runs(results, list(dict.fromkeys(game for suite in suites for game in suite.games)))
-    agents = sorted(chosen, key=lambda agent: (agent.startswith("eqr_"), agent))
+    all_games = list(dict.fromkeys(game for suite in suites for game in suite.games))
+    games, chosen, notes = choose_runs(results, all_games, force)
+    if baseline is not None and baseline not in chosen:
+        raise ValueError(f"--baseline: expected one of {', '.join(chosen)}, found {baseline!r}")
+    agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent))
+    notes += settings_differences(results)
     used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
     differing = protocol_differences(used)
     if differing and not force:
         told = " ".join(f"{agent}: {what}." for agent, what in differing.items())
         raise ValueError(
             f"protocol: expected the same for every run of a game, found {told} "
-            "Report these agents apart, or pass --force to mark them in every table."
+            "Choose with --agents, or pass --force to mark them in every table."
         )
     episodes = score_table(results)
-    runs = [(result["agent"], result["game"], result["seed"]) for result in used]
-    scores = [_final_scores(episodes[pd.MultiIndex.from_frame(episodes[["agent", "game", "seed"]]).isin(runs)])]
+    keys = [(result["agent"], result["game"], result["seed"]) for result in used]
+    scores = [_final_scores(episodes[pd.MultiIndex.from_frame(episodes[["agent", "game", "seed"]]).isin(keys)])]
     known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
     for name, path in references.items():
         if name in agents:
             raise ValueError(f"reference {name}: expected a name that no agent has, found the agent {name}. Rename it.")
-        scores.append(read_runs(path, name, games, known).rename(columns={"score": "raw"}))
+        runs = read_runs(path, name, games, known)
+        notes += [runs.attrs["note"]] if "note" in runs.attrs else []
+        scores.append(runs.rename(columns={"score": "raw"}))
     order = [*agents, *references]
     table = pd.concat(scores, ignore_index=True).sort_values("agent", key=lambda names: names.map(order.index), kind="stable")
     table["score"] = [normalize(raw, bounds[game]) for game, raw in zip(table["game"], table["raw"], strict=True)]
+    if suites[0].normalisation["unit"].startswith("human-normali") and {r["protocol"]["steps"] for r in used} != {
+        PUBLISHED_STEPS
+    }:
+        notes.append("Published scores are of 100,000 training steps, these are not: they do not stand beside.")
     return Comparison(
         suite=" + ".join(dict.fromkeys(suite.name for suite in suites)),
         unit=suites[0].normalisation["unit"],
@@ -118,6 +141,17 @@ def compare(folders: list[pathlib.Path], references: Mapping[str, pathlib.Path],
         differing=differing,
         notes=notes,
     )
+
+
+def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[str, Any]]:
+    """
+    :param agents: those to keep; none: all
+    :raises ValueError: for one that has no finished run
+    """
+    there = {result["agent"] for result in results}
+    if missing := [agent for agent in agents if agent not in there]:
+        raise ValueError(f"--agents: expected some of {', '.join(sorted(there))}, found {', '.join(missing)}")
+    return [result for result in results if not agents or result["agent"] in agents]
 
 
 def _read_suite(folder: pathlib.Path) -> Suite:

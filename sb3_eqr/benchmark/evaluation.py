@@ -8,14 +8,15 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from rl_zoo3.utils import get_wrapper_class
+from stable_baselines3.common.atari_wrappers import ClipRewardEnv, EpisodicLifeEnv, WarpFrame
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.env_util import is_wrapped, make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
 
-SEED_OFFSET = 1_000_000  # evaluation plays other games than training
+FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation plays other games than training, and than that of another seed
 
 
 class EpsilonGreedy:
@@ -55,24 +56,54 @@ class EpsilonGreedy:
         return actions, state
 
 
-def make_evaluation_env(protocol: dict[str, Any], entry: dict[str, Any], model: BaseAlgorithm, seed: int) -> VecEnv:
+def preprocessing_of(protocol: dict[str, Any]) -> dict[str, Any]:
     """
     :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :param entry: the agent's hyperparameters, whose preprocessing stands where the protocol has none
+    :return: that of evaluation
+    """
+    return {**protocol["preprocessing"], **protocol["evaluation"]["preprocessing"]}
+
+
+def make_game(protocol: dict[str, Any]) -> gym.Env:
+    """
+    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :return: one environment for evaluation
+    """
+    settings = preprocessing_of(protocol)
+    env = gym.make(protocol["env_id"], **(settings.get("env_kwargs") or {}))
+    wrap = get_wrapper_class(settings)
+    env = env if wrap is None else wrap(env)
+    max_steps = protocol["evaluation"]["max_steps"]
+    return env if max_steps is None else TimeLimit(env, max_steps)
+
+
+def check_game(protocol: dict[str, Any]) -> spaces.Space:
+    """
+    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :return: the action space
+    :raises ValueError: if evaluation would not see whole games and raw scores
+    """
+    env = make_game(protocol)
+    found = [kind.__name__ for kind in (ClipRewardEnv, EpisodicLifeEnv) if is_wrapped(env, kind)]
+    if "AtariEnv" in str(gym.spec(protocol["env_id"]).entry_point) and not is_wrapped(env, WarpFrame):
+        found.append("no preprocessing")
+    env.close()
+    if found:
+        raise ValueError(
+            f"{protocol['env_id']}: expected evaluation on whole games with raw scores, found {', '.join(found)}. "
+            "Set preprocessing under evaluation in the suite, as atari100k in sb3_eqr/benchmark/suites.yml does."
+        )
+    return env.action_space
+
+
+def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: int) -> VecEnv:
+    """
+    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
     :param model: whose statistics normalise the observations, where it was trained so
     :param seed: of the first environment; the others count up
     """
-    evaluation = protocol["evaluation"]
-    settings = {**entry, **protocol["preprocessing"], **evaluation["preprocessing"]}
-    wrap = get_wrapper_class(settings)
-
-    def make_env() -> gym.Env:
-        env = gym.make(protocol["env_id"], **settings.get("env_kwargs", {}))
-        env = env if wrap is None else wrap(env)
-        return env if evaluation["max_steps"] is None else TimeLimit(env, evaluation["max_steps"])
-
     # Monitor outside the wrappers: an episode is what the protocol says it is.
-    env = make_vec_env(make_env, n_envs=evaluation["n_envs"], seed=seed)
+    env = make_vec_env(make_game, n_envs=protocol["evaluation"]["n_envs"], seed=seed, env_kwargs={"protocol": protocol})
     trained = model.get_vec_normalize_env()
     if trained is not None:
         env = VecNormalize(
@@ -84,28 +115,24 @@ def make_evaluation_env(protocol: dict[str, Any], entry: dict[str, Any], model: 
             epsilon=trained.epsilon,
         )
         env.obs_rms = copy.deepcopy(trained.obs_rms)
-    if settings.get("frame_stack"):
-        env = VecFrameStack(env, settings["frame_stack"])
-    return env
+    n_stack = preprocessing_of(protocol).get("frame_stack")
+    return VecFrameStack(env, n_stack) if n_stack else env
 
 
-def evaluate(
-    model: BaseAlgorithm, protocol: dict[str, Any], entry: dict[str, Any], n_episodes: int, seed: int
-) -> tuple[list[float], list[int]]:
+def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
     Scores and lengths of whole episodes. Every environment plays its share of them and no more, so that short episodes are
     not counted too often. Nothing of the agent changes, nor of the random generators.
 
     :param model: the agent
     :param protocol: see :func:`make_evaluation_env`
-    :param entry: see :func:`make_evaluation_env`
     :param n_episodes: number of episodes
     :param seed: of the run
     """
     before = get_rng_state(model.action_space)
-    env = make_evaluation_env(protocol, entry, model, SEED_OFFSET + seed)
+    env = make_evaluation_env(protocol, model, FIRST_SEED + SEEDS * seed)
     try:
-        player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, SEED_OFFSET + seed)
+        player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, FIRST_SEED + SEEDS * seed)
         scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)  # type: ignore[arg-type]
     finally:
         env.close()

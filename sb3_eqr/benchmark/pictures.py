@@ -80,7 +80,7 @@ def _intervals(
     rows = analysis.aggregates[analysis.aggregates["agent"].isin(agents)].copy()
     rows["agent"] = [label(analysis.comparison, agent) for agent in rows["agent"]]
     points = aggregate_means(published(analysis.comparison, methods), analysis.comparison)
-    shown = {method.label: f"{method.label}, {method.runs} runs" for method in methods}
+    shown = {method.label: f"{method.label}, {method.n_runs}" for method in methods}
     points["label"] = points["label"].map(shown).astype(str)
     caption = f"{explained} Over all runs and games.{_intervals_are(analysis, 'Bars are')}"
     if len(points):

@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 from filelock import FileLock, Timeout
 
 from sb3_eqr.benchmark.agents import Agent, find_agent, hyperparameters
-from sb3_eqr.benchmark.run import ERROR, LOCK, PLAN, PROGRESS, RESULT, Run, write_json
+from sb3_eqr.benchmark.checkpoints import find_checkpoints
+from sb3_eqr.benchmark.evaluation import check_game
+from sb3_eqr.benchmark.run import ERROR, LOCK, PLAN, PROGRESS, RESULT, Run, to_json, write_json
+from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.suites import Suite, read_suite, write_suite
 
 SUITE = "suite.yml"
@@ -42,14 +45,15 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
     names = [agent.name for agent in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"--agents: expected different agents, found {', '.join(sorted(twice))} more than once")
-    for agent in found:
-        for game in suite.games:
-            hyperparameters(agent, suite.protocol(game))
+    entries = {}
+    for game in suite.games:
+        action_space = check_game(suite.protocol(game))
+        for agent in found:
+            entries[agent, game] = hyperparameters(agent, suite.protocol(game), action_space)
     runs = [
-        Run(run_folder(folder, agent, game, seed), agent, suite.name, game, seed, suite.protocol(game))
+        Run(run_folder(folder, *key, seed), key[0], suite.name, key[1], seed, suite.protocol(key[1]), entry)
         for seed in range(n_seeds)
-        for game in suite.games
-        for agent in found
+        for key, entry in entries.items()
     ]
     for run in runs:
         check_plan(run)
@@ -65,18 +69,21 @@ def run_folder(folder: pathlib.Path, agent: Agent, game: str, seed: int) -> path
 
 def check_plan(run: Run) -> None:
     """
-    :raises ValueError: if the folder holds the same run with another protocol
+    :raises ValueError: if the folder holds the same run, begun with other settings
     """
     path = run.folder / PLAN
-    if not path.is_file():
+    begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or is_locked(run)
+    if not (path.is_file() and begun):
         return
-    old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(json.dumps(run.description()))
-    for key, value in old["protocol"].items():
-        if new["protocol"].get(key) != value:
-            raise ValueError(
-                f"{run.folder}: expected {key} {new['protocol'].get(key)!r}, found a run with {value!r}. "
-                "Scores of different protocols do not compare: use another folder, or the same settings."
-            )
+    old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(to_json(run.description()))
+    for what in ("protocol", "entry"):
+        before, now = (flatten({key: v for key, v in plan[what].items() if key != "file"}) for plan in (old, new))
+        for key in sorted(before.keys() | now.keys()):
+            if before.get(key) != now.get(key):
+                raise ValueError(
+                    f"{run.folder}: expected {key} {now.get(key)!r}, found a run with {before.get(key)!r}. "
+                    "Scores of different settings do not compare: use another folder, or the same settings."
+                )
 
 
 def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
@@ -99,8 +106,10 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
     write_suite(suite, path)
     for run in runs:
         run.folder.mkdir(parents=True, exist_ok=True)
-        if not (run.folder / PLAN).is_file():
-            write_json(run.folder / PLAN, run.description())
+        description = to_json(run.description())
+        path = run.folder / PLAN
+        if not (path.is_file() and path.read_text(encoding="utf-8") == description):
+            write_json(path, run.description())
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:
@@ -112,7 +121,8 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
     for path in sorted(folder.glob(f"runs/*/*/*/{PLAN}"), key=lambda path: (int(path.parent.name), path)):
         plan = json.loads(path.read_text(encoding="utf-8"))
         agent = Agent(plan["agent"], plan["entry"]["algo"], pathlib.Path(plan["entry"]["file"]))
-        runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], plan["protocol"]))
+        entry = plan["entry"]["hyperparameters"]
+        runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], plan["protocol"], entry))
     if not runs:
         raise ValueError(
             f"{folder}: expected the folder of a benchmark, found no runs in it. Start one: "

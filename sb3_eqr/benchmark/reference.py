@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 RANDOM, HUMAN = "Random", "Human"  # the two methods that scores are normalised by
+PUBLISHED_STEPS = 100_000  # of the agents whose scores are bundled
 
 
 class PublishedMethod(NamedTuple):
@@ -21,6 +22,12 @@ class PublishedMethod(NamedTuple):
     method: str
     label: str
     runs: int  # that the published means are over, which the EqR paper tells in the captions of its tables
+    most: int | None = None  # where games differ in it
+
+    @property
+    def n_runs(self) -> str:
+        """In words."""
+        return f"{self.runs} runs" if self.most is None else f"{self.runs} to {self.most} runs"
 
 
 # The EqR paper's own agents by their losses, and the methods they are usually held against, from the source with most runs.
@@ -32,7 +39,7 @@ SHOWN = (
     PublishedMethod("DER (rliable, 100 runs)", "DER", 100),
     PublishedMethod("DrQ (rliable, 100 runs)", "DrQ", 100),
     PublishedMethod("SPR (rliable, 100 runs)", "SPR", 100),
-    PublishedMethod("BBF RR8_BBF", "BBF, replay ratio 8", 60),
+    PublishedMethod("BBF RR8_BBF", "BBF, replay ratio 8", 52, 60),
 )
 SHOWN_LOSSES = SHOWN[:4]  # Table 4
 SHOWN_GROUPS = (  # Table 3
@@ -147,7 +154,8 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
     :param name: what to call the method
     :param games: that are needed
     :param others: further games that may be there and are left out
-    :return: columns agent, game, seed, score; as many runs on every game as the game with fewest has
+    :return: columns agent, game, seed, score; as many runs on every game as the game with fewest has, the first ones; where
+        that leaves some out, ``attrs["note"]`` says so
     :raises ValueError: for a file that is no JSON or has another form, and for missing and unknown games
     """
     games = list(games)
@@ -174,7 +182,11 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
     wanted = {game: content[given] for given, game in matched.items() if game in games}
     runs = min(map(len, wanted.values()))
     rows = [(name, game, seed, float(score)) for game in games for seed, score in enumerate(wanted[game][:runs])]
-    return pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
+    table = pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
+    if most := max(map(len, wanted.values())) - runs:
+        fewest = next(game for game, scores in wanted.items() if len(scores) == runs)
+        table.attrs["note"] = f"{name}: its first {runs} runs, as many as {fewest} has; other games have up to {most} more."
+    return table
 
 
 def _not_among(others: Iterable[str], games: list[str]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
@@ -26,6 +26,8 @@ def write_report(
     references: Mapping[str, pathlib.Path],
     force: bool,
     output: pathlib.Path,
+    agents: Sequence[str] = (),
+    baseline: str | None = None,
     reps: int = REPS,
 ) -> pathlib.Path:
     """
@@ -33,13 +35,15 @@ def write_report(
 
     :param folders: of benchmarks, with suite.yml and runs/
     :param references: name -> JSON file with the runs of another method, game -> raw scores
-    :param force: compare agents that ran under different protocols, and mark them
+    :param force: compare agents that ran under different protocols, and mark them, or that have not all games
     :param output: folder to write into; it is made if there is none
+    :param agents: those to compare; none: all
+    :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first
     :param reps: bootstrap samples behind every interval
     :return: the path of report.html
     :raises ValueError: where nothing can be compared, or comparing would mislead; the message says what to do
     """
-    comparison = compare(folders, references, force)
+    comparison = compare(folders, references, force, agents, baseline)
     analysis = analyse(comparison, reps)
     table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means)
     figures, files = sections.draw(all_pictures(analysis))
@@ -62,6 +66,8 @@ def write_report(
     title = f"Benchmark {comparison.suite}"
     page = sections.page(title, sections.lead(comparison), [*notes(analysis), *without], content)
     files["report.html"] = page.encode()  # last: who finds it finds the rest
+    for note in notes(analysis):
+        print(f"Note: {note}")
     for name, content_bytes in files.items():
         with atomic_write(pathlib.Path(output) / name, pathlib.Path(name).suffix[1:]) as file:
             file.write(content_bytes)

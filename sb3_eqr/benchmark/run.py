@@ -15,6 +15,7 @@ import traceback
 from typing import Any
 
 import torch as th
+import yaml
 from filelock import FileLock, Timeout
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -22,13 +23,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_eqr import envs
-from sb3_eqr.benchmark.agents import Agent, hyperparameters
+from sb3_eqr.benchmark.agents import Agent
 from sb3_eqr.benchmark.checkpoints import find_checkpoints, load_checkpoint, remove_checkpoints, write_checkpoint
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.common.safe_files import atomic_write
 from sb3_eqr.zoo import register
 
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"
+STARTS = "starts.txt"  # a line whenever the run is begun or resumed
 PACKAGES = (
     "sb3-eqr",
     "stable-baselines3",
@@ -53,6 +55,7 @@ class Run:
     :param game: name of the game
     :param seed: of everything
     :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :param entry: of :func:`~sb3_eqr.benchmark.agents.hyperparameters`
     """
 
     folder: pathlib.Path
@@ -61,6 +64,7 @@ class Run:
     game: str
     seed: int
     protocol: dict[str, Any]
+    entry: dict[str, Any]
 
     def description(self) -> dict[str, Any]:
         """
@@ -72,7 +76,7 @@ class Run:
             "seed": self.seed,
             "suite": self.suite,
             "protocol": self.protocol,
-            "entry": {"algo": self.agent.algo, "file": str(self.agent.file)},
+            "entry": {"algo": self.agent.algo, "file": str(self.agent.file), "hyperparameters": self.entry},
         }
 
 
@@ -93,10 +97,17 @@ class Settings:
     checkpoint_seconds: float = 300.0
 
 
+def to_json(value: Any) -> str:
+    """
+    :return: as it is written into files
+    """
+    return json.dumps(value, indent=1, default=str)
+
+
 def write_json(path: pathlib.Path, value: Any) -> None:
     """Write a file beside ``path`` and rename it."""
     with atomic_write(path, "json") as file:
-        file.write(json.dumps(value, indent=1, default=str).encode())
+        file.write(to_json(value).encode())
 
 
 def new_record() -> dict[str, Any]:
@@ -104,10 +115,8 @@ def new_record() -> dict[str, Any]:
     :return: what a run measures
     """
     return {
-        "started": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "seconds": 0.0,
         "training_seconds": 0.0,
-        "sessions": 0,
         "resumed_at": [],
         "resumed_exactly": True,
         "evaluations": [],
@@ -137,13 +146,12 @@ class RunCallback(BaseCallback):
 
     :param run: the run
     :param record: what was measured so far
-    :param entry: hyperparameters of the agent
     :param settings: the settings
     """
 
-    def __init__(self, run: Run, record: dict[str, Any], entry: dict[str, Any], settings: Settings):
+    def __init__(self, run: Run, record: dict[str, Any], settings: Settings):
         super().__init__()
-        self.run, self.record, self.entry, self.settings = run, record, entry, settings
+        self.run, self.record, self.settings = run, record, settings
         self.steps = run.protocol["steps"]
         curve = run.protocol["evaluation"]["curve"]
         self.due = [self.steps * point // curve["points"] for point in range(1, curve["points"])]
@@ -163,7 +171,7 @@ class RunCallback(BaseCallback):
             self.saved = time.monotonic()
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
+        for info in self.locals.get("infos", []):
             if "episode" in info:
                 self.record["training"]["step"].append(self.num_timesteps)
                 self.record["training"]["score"].append(float(info["episode"]["r"]))
@@ -171,15 +179,21 @@ class RunCallback(BaseCallback):
         if time.monotonic() - self.noted >= PROGRESS_SECONDS:
             self.clock.read("training_seconds")
             self.note_progress()
-        number = sum(row["kind"] == "curve" for row in self.record["evaluations"])
-        if number < len(self.due) and self.due[number] <= self.num_timesteps < self.steps and self.has_settled():
+        if self.is_due() and self.has_settled():
             self.clock.read("training_seconds")
-            add_evaluation(self.model, self.run, self.entry, self.record, "curve", self.curve_episodes)
+            add_evaluation(self.model, self.run, self.record, "curve", self.curve_episodes)
             self.clock.read("seconds")
         return self.num_timesteps < self.steps
 
     def _on_training_end(self) -> None:
         self.clock.read("training_seconds")
+
+    def is_due(self) -> bool:
+        """
+        :return: whether a point of the learning curve has come since the last evaluation
+        """
+        last = max((row["step"] for row in self.record["evaluations"]), default=0)
+        return any(last < step <= self.num_timesteps < self.steps for step in self.due)
 
     def has_settled(self) -> bool:
         """
@@ -219,24 +233,23 @@ class Clock:
         self._last = now
 
 
-def add_evaluation(
-    model: BaseAlgorithm, run: Run, entry: dict[str, Any], record: dict[str, Any], kind: str, n_episodes: int
-) -> None:
+def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind: str, n_episodes: int) -> None:
     """
     :param kind: "curve" or "final"
     """
-    scores, lengths = evaluate(model, run.protocol, entry, n_episodes, run.seed)
+    scores, lengths = evaluate(model, run.protocol, n_episodes, run.seed)
     record["evaluations"].append({"step": model.num_timesteps, "kind": kind, "scores": scores, "lengths": lengths})
 
 
-def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback], dict[str, Any]]:
+def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
     """
     The agent as RL Zoo builds it, on environments that write no files.
 
-    :return: the agent, the callbacks of its entry, the entry
+    :return: the agent, the callbacks of its entry
     """
-    entry = hyperparameters(run.agent, run.protocol)
     with tempfile.TemporaryDirectory() as logs, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        config = pathlib.Path(logs) / "entry.yml"
+        config.write_text(yaml.safe_dump({run.protocol["env_id"]: run.entry}), encoding="utf-8")
         manager = ExperimentManager(
             argparse.Namespace(),
             run.agent.algo,
@@ -244,11 +257,10 @@ def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback], dic
             logs,
             n_timesteps=run.protocol["steps"],
             eval_freq=-1,
-            hyperparams=dict(run.protocol["preprocessing"]),
             seed=run.seed,
             verbose=0,
             device=device,
-            config=str(run.agent.file),
+            config=str(config),
         )
         experiment = manager.setup_experiment()
         assert experiment is not None
@@ -257,10 +269,10 @@ def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback], dic
         model.set_env(manager.create_envs(manager.n_envs, no_log=True))
         if old is not None:
             old.close()
-    return model, manager.callbacks, entry
+    return model, manager.callbacks
 
 
-def provenance(run: Run, entry: dict[str, Any], model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
+def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
     """
     :return: what was run and on what
     """
@@ -269,13 +281,8 @@ def provenance(run: Run, entry: dict[str, Any], model: BaseAlgorithm, settings: 
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
     device = th.cuda.get_device_name(model.device) if model.device.type == "cuda" else model.device.type
-    description = run.description()
-    path = run.agent.file
-    file = "stock/" + path.stem if path.parent.name == "stock" else path.stem
-    name = run.protocol["env_id"]
     return {
-        **description,
-        "entry": {"algo": run.agent.algo, "file": file, "name": name, "hyperparameters": entry},
+        **run.description(),
         "versions": {"python": platform.python_version(), **versions},
         "machine": {"device": device, "threads": settings.n_threads, "platform": platform.platform(), "host": platform.node()},
         "command": settings.command,
@@ -287,28 +294,35 @@ def train(run: Run, settings: Settings) -> None:
     started = time.monotonic()
     envs.register()
     register()
-    model, callbacks, entry = build(run, settings.device)
+    with open(run.folder / STARTS, "a", encoding="utf-8") as file:
+        file.write(datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds") + "\n")
+    model, callbacks = build(run, settings.device)
     record = new_record()
     checkpoints = find_checkpoints(run.folder)
     if checkpoints:
         model, record, is_exact = load_checkpoint(checkpoints[-1], model)
         record["resumed_at"].append(model.num_timesteps)
         record["resumed_exactly"] &= is_exact
-    record["sessions"] += 1
     record["seconds"] += time.monotonic() - started
     steps = run.protocol["steps"]
     if model.num_timesteps < steps:
         model.set_logger(Logger(folder=None, output_formats=[LossWriter(record["losses"])]))
-        callback = RunCallback(run, record, entry, settings)
+        callback = RunCallback(run, record, settings)
         model.learn(steps - model.num_timesteps, [*callbacks, callback], reset_num_timesteps=not checkpoints)
         write_checkpoint(run.folder, model, record, is_final=True)
     finishing = Clock(record)
-    add_evaluation(model, run, entry, record, "final", run.protocol["evaluation"]["episodes"])
+    add_evaluation(model, run, record, "final", run.protocol["evaluation"]["episodes"])
     finishing.read("seconds")
     seconds = record.pop("seconds")
     rate = steps / max(record["training_seconds"], 1e-9)
-    times = {"wall_clock_s": round(seconds, 2), "steps_per_second": round(rate, 2), "attempts": record["sessions"]}
-    write_json(run.folder / RESULT, {**provenance(run, entry, model, settings), **record, **times})
+    starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
+    times = {
+        "started": starts[0],
+        "attempts": len(starts),
+        "wall_clock_s": round(seconds, 2),
+        "steps_per_second": round(rate, 2),
+    }
+    write_json(run.folder / RESULT, {**provenance(run, model, settings), **times, **record})
     model.get_env().close()  # type: ignore[union-attr]
     remove_checkpoints(run.folder)
 
@@ -334,7 +348,7 @@ def execute(run: Run, settings: Settings) -> str:
                 if isinstance(error, SystemExit):  # would end Ray's worker, too
                     raise RuntimeError(f"{run.agent.file}: cannot be used (exit {error.code})") from error
                 raise
-            for name in (ERROR, PROGRESS):
+            for name in (ERROR, PROGRESS, STARTS):
                 (run.folder / name).unlink(missing_ok=True)
             return "finished"
     except Timeout:

@@ -1,5 +1,6 @@
 """Running a benchmark: one task of Ray per run, and the table that shows where they are."""
 
+import contextlib
 import datetime
 import logging
 import os
@@ -183,23 +184,27 @@ class Dispatcher:
             outcome = self.ray.get(reference)
         except self.ray.exceptions.RayError as error:
             self.attempts[index] += 1
-            reason = str(getattr(error, "cause", None) or error).strip().splitlines()[-1]
+            cause = getattr(error, "cause", None) or error
+            reason = " ".join([type(cause).__name__, *str(cause).strip().splitlines()[-1:]])
             again = self.attempts[index] < ATTEMPTS
-            self.console.print(
-                f"{label}: crashed ({reason}). " + ("Trying once more." if again else f"See {run.folder / ERROR}")
-            )
+            what_next = "Trying once more." if again else f"See {run.folder / ERROR}"
+            self.say(f"{label}: crashed ({reason}). {what_next}")
             if again:
                 self.submit(index)
             else:
                 self.failed.append(index)
                 if not (run.folder / ERROR).is_file():  # it was killed before it could say anything
-                    with atomic_write(run.folder / ERROR, "txt") as file:
+                    with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
                         file.write(str(error).encode())
             return
         if outcome == "busy":
             self.busy.append((time.monotonic() + BUSY_SECONDS, index))
         else:
-            self.console.print(f"{label}: finished")
+            self.say(f"{label}: finished")
+
+    def say(self, text: str) -> None:
+        """A line above the table."""
+        self.console.print(text, soft_wrap=True, markup=False, highlight=False)
 
     def look(self) -> None:
         """Where the runs stand now; what is done is not looked at again."""

@@ -112,7 +112,8 @@ def differences(analysis: Analysis) -> str:
         f"Differences of the IQM, each agent against {label(analysis.comparison, against[0])}, the first of the benchmark"
         + (f", and against {label(analysis.comparison, against[1])}, the best. " if len(against) > 1 else ". ")
         + "A difference counts if it is larger than what the runs can show: the half-width of a 95% interval around no "
-        "difference, by the spread that the stratified bootstrap finds. Of twenty pairs that are alike, one passes by chance."
+        "difference, by the spread that the stratified bootstrap finds. Of twenty pairs that are alike, about one passes by "
+        "chance; more where one of the two was chosen for its score, as the best is."
     )
     parts = [paragraph(text), bullets(difference_in_words(row, analysis.comparison) for row in rows)]
     if analysis.comparison.human:
@@ -138,7 +139,7 @@ def game_table_notes(analysis: Analysis) -> list[str]:
     )
     if len(analysis.means.columns):
         sources = load_reference().drop_duplicates("method").set_index("method")["source"]
-        notes += [f"† {m.label}: game means only ({m.runs} runs), no interval. {sources[m.method]}." for m in SHOWN]
+        notes += [f"† {m.label}: 100K steps, game means only ({m.n_runs}), no interval. {sources[m.method]}." for m in SHOWN]
     notes += [f"‡ {agent}: another protocol: {what}." for agent, what in comparison.differing.items()]
     return notes
 

@@ -46,14 +46,33 @@ def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
     return {prefix: values}
 
 
-def choose_runs(results: list[dict[str, Any]], suite_games: list[str]) -> tuple[list[str], dict[str, list[int]], list[str]]:
+def settings_differences(results: list[dict[str, Any]]) -> list[str]:
+    """
+    :param results: of runs
+    :return: a sentence for every agent whose runs of a game have not all the same hyperparameters
+    """
+    found: dict[str, dict[str, None]] = {}
+    first: dict[tuple[str, str], dict[str, Any]] = {}
+    for result in results:
+        own = flatten(result["entry"]["hyperparameters"])
+        usual = first.setdefault((result["agent"], result["game"]), own)
+        for key in own.keys() | usual.keys():
+            if own.get(key) != usual.get(key):
+                found.setdefault(result["agent"], {})[key] = None
+    return [f"{agent}: its runs do not all have the same {', '.join(sorted(keys))}." for agent, keys in found.items()]
+
+
+def choose_runs(
+    results: list[dict[str, Any]], suite_games: list[str], force: bool
+) -> tuple[list[str], dict[str, list[int]], list[str]]:
     """
     The games that every agent has runs on, and of each agent the seeds that it has on all of them.
 
     :param results: of all finished runs
     :param suite_games: all games, in order
+    :param force: go on with the games in common where some agent lacks others
     :return: games, agent -> seeds, sentences on what is left out
-    :raises ValueError: if no game, or no seed of an agent, is left
+    :raises ValueError: if scores are missing for some games, or no game, or no seed of an agent, is left
     """
     present: dict[str, dict[str, set[int]]] = {}
     for result in results:
@@ -64,11 +83,18 @@ def choose_runs(results: list[dict[str, Any]], suite_games: list[str]) -> tuple[
     nobody = [game for game in all_games if all(game in missing for missing in lacking.values())]
     if not games:
         told = "; ".join(f"{agent} has {', '.join(by_game)}" for agent, by_game in present.items())
-        raise ValueError(f"games: expected one or more that every agent has run, found none: {told}. Report fewer agents.")
+        raise ValueError(
+            f"games: expected one or more that every agent has run, found none: {told}. Choose some with --agents."
+        )
     notes = [f"No finished run of any agent: {', '.join(nobody)}."] if nobody else []
     for agent, missing in lacking.items():
         if own := [game for game in missing if game not in nobody]:
             notes.append(f"{agent} has no finished run on {', '.join(own)}.")
+    if notes and not force:
+        raise ValueError(
+            f"expected scores of every agent on every game, found some missing. {' '.join(notes)} Finish the runs, choose "
+            "with --agents, or pass --force to compare the games that all have."
+        )
     if len(games) < len(all_games):
         notes.append(f"Compared are the {len(games)} of {len(all_games)} games that every agent has: {', '.join(games)}.")
     chosen = {}

@@ -11,6 +11,7 @@ import yaml
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
+from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.safe_files import atomic_write
 
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
@@ -72,6 +73,15 @@ def check_keys(where: str, found: Iterable[str], legal: set[str], needed: set[st
         raise ValueError(f"{where}: expected the keys {', '.join(sorted(needed))}, found no {', '.join(sorted(missing))}")
 
 
+def check_mapping(where: str, value: Any) -> dict[str, Any]:
+    """
+    :raises ValueError: if it is no mapping
+    """
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: expected keys and values, found {value!r}")
+    return value
+
+
 def human_scores(games: list[str]) -> dict[str, Any]:
     """
     :return: the normalisation of Atari 100K: random play 0, a human tester 1
@@ -93,21 +103,36 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     :raises ValueError: for an entry that is not complete, with what is wrong
     """
     where = f"{where}, suite {name!r}"
+    check_mapping(where, entry)
     needed = {"env_id", "games", "steps", "evaluation"}
     check_keys(where, entry, needed | {"preprocessing", "normalisation"}, needed)
+    if not isinstance(entry["games"], list) or not entry["games"]:
+        raise ValueError(f"{where}: games: expected a list, found {entry['games']!r}")
+    if "{game}" not in str(entry["env_id"]) and len(entry["games"]) > 1:
+        raise ValueError(f"{where}: env_id: expected {{game}} in it, found {entry['env_id']!r}")
     games = [str(game) for game in entry["games"]]
     steps = entry["steps"] if isinstance(entry["steps"], dict) else dict.fromkeys(games, entry["steps"])
     if missing := [game for game in games if game not in steps]:
         raise ValueError(f"{where}: expected steps for every game, found none for {', '.join(missing)}")
     if wrong := [game for game in games if not (isinstance(steps[game], int) and steps[game] > 0)]:
         raise ValueError(f"{where}: steps: expected whole numbers above 0, found {steps[wrong[0]]!r} for {wrong[0]}")
-    evaluation = {"max_steps": None, "preprocessing": entry.get("preprocessing", {}), "epsilon": 0.0} | entry["evaluation"]
+    evaluation = {"max_steps": None, "preprocessing": entry.get("preprocessing", {}), "epsilon": 0.0}
+    evaluation |= check_mapping(f"{where}: evaluation", entry["evaluation"])
     check_keys(f"{where}: evaluation", evaluation, EVALUATION, EVALUATION)
-    check_keys(f"{where}: evaluation: curve", evaluation["curve"], CURVE, CURVE)
+    check_keys(f"{where}: evaluation: curve", check_mapping(f"{where}: curve", evaluation["curve"]), CURVE, CURVE)
+    for key in ("episodes", "n_envs"):
+        check_number(f"{where}: evaluation: {key}", evaluation[key], 1, whole=True)
+    for key in CURVE:
+        check_number(f"{where}: evaluation: curve: {key}", evaluation["curve"][key], 1, whole=True)
+    check_number(f"{where}: evaluation: epsilon", evaluation["epsilon"], 0, 1)
     normalisation = entry.get("normalisation", {"unit": "raw score", "source": "none", "scores": {g: [0, 1] for g in games}})
     if normalisation == "human":
         normalisation = human_scores(games)
-    check_keys(f"{where}: normalisation", normalisation, NORMALISATION, NORMALISATION)
+    check_keys(
+        f"{where}: normalisation", check_mapping(f"{where}: normalisation", normalisation), NORMALISATION, NORMALISATION
+    )
+    if missing := [game for game in games if game not in normalisation["scores"]]:
+        raise ValueError(f"{where}: normalisation: expected two scores for every game, found none for {', '.join(missing)}")
     return Suite(
         name,
         games,

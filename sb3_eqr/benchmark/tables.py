@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import HUMAN, RANDOM, PublishedMethod, published_means
+from sb3_eqr.benchmark.reference import HUMAN, PUBLISHED_STEPS, RANDOM, PublishedMethod, published_means
 from sb3_eqr.benchmark.statistics import METRICS, games_above
 
 MARK = "‡"  # at the name of an agent with another protocol
@@ -189,11 +189,11 @@ def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame
 
 def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.DataFrame:
     """
-    :return: rows games, columns methods, raw mean scores; without columns where the suite is not normalised by human scores
-        or a compared game has no published score
+    :return: rows games, columns methods, raw mean scores; without columns where a run has other steps than theirs, the suite
+        is not normalised by human scores, or a compared game has no published score
     """
     none = pd.DataFrame(index=comparison.games)
-    if not comparison.human:
+    if not comparison.human or comparison.steps != {PUBLISHED_STEPS}:
         return none
     means = published_means(methods, comparison.games)
     return means if len(means) == len(comparison.games) else none

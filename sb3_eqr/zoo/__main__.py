@@ -39,6 +39,7 @@ EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas",
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)}}} ...
 
 Every command takes RL Zoo's arguments: sb3-eqr train --help
+Comparisons of agents over games and seeds: sb3-eqr benchmark --help
 push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
 
 
@@ -171,7 +172,9 @@ def main() -> None:
         return
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in COMMANDS:
-        fail(f"expected one of {', '.join(COMMANDS)}, found {command!r}.{nearest(command, COMMANDS)}")
+        fail(
+            f"expected one of {', '.join(COMMANDS)}, benchmark, found {command!r}.{nearest(command, [*COMMANDS, 'benchmark'])}"
+        )
     register()
     if command.endswith("_hub"):
         from sb3_eqr.zoo import hub

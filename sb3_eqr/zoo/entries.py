@@ -50,22 +50,28 @@ def read_file(path: str) -> dict[str, Any]:
         fail(f"{path} is no YAML: {error}")
 
 
-def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
+def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
     """
     :param path: of the file
     :param env_id: the environment
     :param changes: of the command line
-    :return: the entry with the changes, ``policy_kwargs`` evaluated; leaves with a message if there is none
+    :return: the entry with the changes, as it is written; leaves with a message if there is none
     """
     entries = read_file(path)
     is_atari = exp_manager.ExperimentManager.is_atari(env_id)
     name = env_id if env_id in entries else "atari" if is_atari else "default"
     if name not in entries:
-        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries)}. Add one, or pass --conf-file with another file.")
+        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries)}. Add one, or use another file.")
     entry = {**(entries[name] or {}), **changes}
     for key in ("policy", "n_timesteps"):
         if key not in entry:
             fail(f"{path}: the entry {name!r} needs {key!r}.")
+    return entry
+
+
+def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
+    """As :func:`find_entry`, with ``policy_kwargs`` evaluated."""
+    entry = find_entry(path, env_id, changes)
     if isinstance(entry.get("policy_kwargs"), str):
         try:
             entry["policy_kwargs"] = eval(entry["policy_kwargs"], vars(exp_manager))
