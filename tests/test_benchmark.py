@@ -5,7 +5,6 @@ import pathlib
 import sys
 from types import SimpleNamespace
 
-import pandas as pd
 import pytest
 import yaml
 from ray.cluster_utils import Cluster
@@ -88,6 +87,7 @@ def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(f
     line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
     line += f" --address {cluster}"
     code, out = sb3_eqr(line)
+    assert "Note: dqn:broken learns" not in out.out
     assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
     assert "failed: dqn:broken, CartPole, seed 0:" in out.out
     assert json.loads(pathlib.Path("b/runs/dqn-fast/CartPole/0/result.json").read_text())["attempts"] == 1
@@ -104,7 +104,10 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
 @pytest.mark.parametrize(
     "line, message",
     [
-        ("run b --suite atari10k --agents dqn", "'atari10k' is none. Did you mean 'atari100k'? There are atari100k, atari"),
+        (
+            "run b --suite atari10k --agents dqn",
+            "there is no suite 'atari10k'. Did you mean 'atari100k'? There are atari100k, atari",
+        ),
         ("run b --suite atari100k --games Pnog --agents dqn", "suite 'atari100k' has no game 'Pnog'. Did you mean 'Pong'?"),
         ("run b --suite smoke --agents dnq", "'dnq' is no algorithm. Did you mean 'dqn'?"),
         ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no such hyperparameters. There are"),
@@ -115,6 +118,9 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite smoke --agents dqn dqn", "expected different agents, found dqn more than once"),
         ("run b --suite smoke", "expected both --suite and --agents, or neither"),
         ("run b", "found no runs in it"),
+        ("run b --steps 30", "--steps: expected --suite and --agents with it"),
+        ("run b --suite smoke --agents eqr_rainbow:se2+aet+", "found se2+aet+get, se2+aet+r, se2+aet+r+get. Write one"),
+        ("run b --suite smoke --agents dqn:other.yml", "'dqn:other.yml': there is no file other.yml"),
         ("status b", "found no runs in it"),
         (f"{RUN} --seeds 0", "--seeds: expected at least 1, found 0"),
         (f"{RUN} --steps 0", "--steps: expected at least 1, found 0"),
@@ -263,4 +269,5 @@ def test_agents_and_their_files():
 
 
 def test_scores_without_runs(tmp_path):
-    assert isinstance(benchmark.load_scores(tmp_path), pd.DataFrame) and benchmark.load_scores(tmp_path).empty
+    with pytest.raises(ValueError, match="found no finished run in it"):
+        benchmark.load_scores(tmp_path)

@@ -187,13 +187,13 @@ def test_the_page_needs_nothing_from_elsewhere(report):
     assert page.count("<figure>") == 7 and page.count("<img") == 7 and page.count("<source media") == 7
     assert set(re.findall(r'href="#(\w+)"', page)) == set(re.findall(r'id="(\w+)"', page))
     assert page.count('<div class="box"') == page.count("<table") + page.count("<pre>")  # all that is wide scrolls by itself
-    assert 'name="viewport"' in page and "Before the numbers" not in page  # nothing to warn of
+    assert 'name="viewport"' in page and page.count("fewer than 5 runs per game") == 1
 
 
 def test_the_page_says_how_to_repeat_it(report):
     page = text_of(report)
     assert page.count("sb3-eqr benchmark run small --agents dqn") == 1
-    assert "Linux" in page and "55.5" in page and "0.50" in page and "batch_size" in page
+    assert "Linux" in page and "55.5" in page and "<td>30.0</td>" in page and "batch_size" in page
     assert "0.058 with 1 seed, 0.026 with 5 seeds, 0.018 with 10 seeds" in page
     assert "SPR in Table 2: the paper prints a mean of 0.704, the scores in its table give 0.703." in page
 
@@ -297,7 +297,7 @@ def test_agents_and_baseline_are_chosen(tmp_path):
     folder = a_benchmark(tmp_path / "a")
     assert compare([folder], {}, False, baseline=FULL).agents == [FULL, "dqn", BASE]
     assert compare([folder], {}, False, [BASE], FULL).agents == [FULL, BASE]
-    with pytest.raises(ValueError, match=r"--agents: expected some of dqn, eqr_rainbow:se2\+aet, .*, found ppo"):
+    with pytest.raises(ValueError, match=r"--agents: 'ppo' has no finished run.* There are dqn, eqr_rainbow:se2"):
         compare([folder], {}, False, ["ppo"])
     with pytest.raises(ValueError, match=r"--baseline: expected one of dqn, eqr.*, found 'ppo'"):
         compare([folder], {}, False, baseline="ppo")
@@ -322,6 +322,24 @@ def test_runs_of_other_hyperparameters_are_told(tmp_path):
     assert compare([a_benchmark(tmp_path / "a", change=change)], {}, False).notes == [
         f"{BASE}: its runs do not all have the same batch_size."
     ]
+
+
+def test_agents_that_learn_nothing_are_told(tmp_path):
+    def change(result):
+        result["entry"]["hyperparameters"]["learning_starts"] = 100_000 if result["agent"] == "dqn" else 99_999
+        return result
+
+    scores = {agent: {"Pong": SCORES[agent]["Pong"]} for agent in ("dqn", FULL)}
+    suite = dataclasses.replace(SUITE, games=["Pong"])
+    assert compare([a_benchmark(tmp_path / "a", scores, suite, change)], {}, False).notes == [
+        "dqn learns nothing on Pong (learning_starts 100,000 of 100,000 steps): it stays as it was made."
+    ]
+
+
+def test_what_is_alike_is_not_bold(tmp_path, not_drawn):
+    scores = {"dqn": {"Pong": [1.0, 2.0]}, "qrdqn": {"Pong": [2.0, 1.0]}}
+    page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=5)
+    assert "<b>" not in text_of(page) and "qrdqn and dqn have the same IQM." in text_of(page)
 
 
 def test_two_folders_are_one_benchmark(tmp_path):

@@ -8,10 +8,13 @@ import sys
 from rich.console import Console
 
 from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of, write_plan
-from sb3_eqr.benchmark.run import ERROR, Settings
+from sb3_eqr.benchmark.run import ERROR, Run, Settings
 from sb3_eqr.benchmark.runner import make_table, run_benchmark
+from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.zoo.checks import check_machine, fail
+
+SEEDS = 5  # of a benchmark where the user does not say
 
 
 def absolute(path: str) -> pathlib.Path:
@@ -33,7 +36,7 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
     run.add_argument("--agents", nargs="+", help="ALGO or ALGO:ENTRIES, such as qrdqn, qrdqn:stock, eqr_rainbow:se2+aet")
     run.add_argument("--games", nargs="+", help="some games of the suite (default: all)")
-    run.add_argument("--seeds", type=int, default=5, help="number of seeds, from 0 (default: 5)")
+    run.add_argument("--seeds", type=int, help=f"number of seeds, from 0 (default: {SEEDS})")
     run.add_argument("--steps", type=int, help="training steps instead of the suite's")
     run.add_argument("--device", default="auto", help="of PyTorch (default: the GPU with --gpus-per-run, else cpu)")
     run.add_argument("--address", help="of a Ray cluster that sees the folder (default: this machine)")
@@ -54,36 +57,59 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def run(args: argparse.Namespace) -> int:
+def check_resources(args: argparse.Namespace) -> str:
     """
     :param args: of ``run``
-    :return: exit status: 1 if a run failed
+    :return: the device of every run
+    :raises ValueError: if runs cannot have what they need
     """
+    if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
+        found = f"{args.cpus_per_run} and {args.gpus_per_run}"
+        raise ValueError(f"--cpus-per-run, --gpus-per-run: expected > 0 and >= 0, found {found}")
     device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
     if args.address is None:  # else the machines of the cluster count
         check_machine(device, False, "")
     if device.startswith("cuda") and args.gpus_per_run == 0:
         raise ValueError(f"--device {device}: expected --gpus-per-run above 0, such as 0.1 for ten runs on a GPU")
-    if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
-        raise ValueError(
-            f"--cpus-per-run, --gpus-per-run: expected > 0 and >= 0, found {args.cpus_per_run} and {args.gpus_per_run}"
-        )
+    return device
+
+
+def make_plan(args: argparse.Namespace) -> list[Run]:
+    """
+    :param args: of ``run``
+    :return: the runs of the benchmark, written into its folder
+    :raises ValueError: for wrong use
+    """
     if args.suite is None and args.agents is None:
-        runs = read_plan(args.folder)
-    elif args.suite is None or args.agents is None:
+        for name in ("suite_file", "games", "seeds", "steps"):
+            if getattr(args, name) is not None:
+                flag = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{flag}: expected --suite and --agents with it; FOLDER alone goes on as it is")
+        return read_plan(args.folder)
+    if args.suite is None or args.agents is None:
         raise ValueError("expected both --suite and --agents, or neither to go on with what the folder holds")
-    else:
-        if args.steps is not None and args.steps < 1:
-            raise ValueError(f"--steps: expected at least 1, found {args.steps}")
-        suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
-        runs = plan_runs(args.folder, suite, args.agents, args.seeds)
-        write_plan(args.folder, suite, runs)
+    if args.steps is not None and args.steps < 1:
+        raise ValueError(f"--steps: expected at least 1, found {args.steps}")
+    suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
+    runs = plan_runs(args.folder, suite, args.agents, SEEDS if args.seeds is None else args.seeds)
+    write_plan(args.folder, suite, runs)
+    return runs
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: of ``run``
+    :return: exit status: 1 if a run failed
+    """
+    device = check_resources(args)
+    runs = make_plan(args)
+    for note in never_learn([planned.description() for planned in runs]):
+        print(f"Note: {note}")
     command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
     settings = Settings(command, device, max(int(args.cpus_per_run), 1), args.checkpoint_every)
-    console = Console()
-    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
-    for run_ in failed:
-        print(f"failed: {run_.agent.name}, {run_.game}, seed {run_.seed}: {run_.folder / ERROR}")
+    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, Console())
+    for lost in failed:
+        print(f"failed: {lost.agent.name}, {lost.game}, seed {lost.seed}: {lost.folder / ERROR}")
     if failed:
         print("The same command tries them again, from their last checkpoints.")
     else:
@@ -120,7 +146,8 @@ def report(args: argparse.Namespace) -> int:
             raise ValueError(f"--reference: expected NAME=FILE, found {text!r}")
         references[name] = pathlib.Path(path)
     output = args.output or args.folders[0] / "report"
-    path = write_report(args.folders, references, args.force, output, args.agents, args.baseline)
+    command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
+    path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, command)
     print(f"Written: {path}")
     return 0
 
@@ -133,7 +160,7 @@ def main() -> None:
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:
-        fail("stopped. The same command goes on from the last checkpoints.")
+        fail("stopped. The same command goes on, from the last checkpoints where there are any.")
 
 
 if __name__ == "__main__":

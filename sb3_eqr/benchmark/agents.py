@@ -8,7 +8,7 @@ import rl_zoo3
 from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
-from sb3_eqr.benchmark.suites import nearest
+from sb3_eqr.benchmark.suites import nearest_name
 from sb3_eqr.configurations import STOCK, configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
@@ -40,21 +40,27 @@ def find_agent(text: str) -> Agent:
     register()
     algo, _, entries = text.partition(":")
     if algo not in ALGOS:
-        raise ValueError(f"--agents: {algo!r} is no algorithm.{nearest(algo, ALGOS)}")
+        raise ValueError(f"--agents: {algo!r} is no algorithm.{nearest_name(algo, ALGOS)}")
     files = configuration_files()
     if not entries:
         own = files[algo] if algo in AGENTS else pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
         return Agent(algo, algo, own)
     if entries.endswith((".yml", ".yaml")):
+        if not pathlib.Path(entries).is_file():
+            raise ValueError(f"--agents: {text!r}: there is no file {entries}")
         return Agent(f"{algo}:{pathlib.Path(entries).stem}", algo, pathlib.Path(entries).resolve())
     name = f"{STOCK}/{algo}" if entries == STOCK else entries
     legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
     longer = [key for key in legal if key.startswith(entries)]
     if name not in files and len(longer) == 1:
         entries = name = longer[0]
+    if name not in files and longer:
+        raise ValueError(
+            f"--agents: {text!r}: expected the beginning of one name, found {', '.join(sorted(longer))}. Write one of them."
+        )
     if name not in files:
         legal += [STOCK] if f"{STOCK}/{algo}" in files else []
-        raise ValueError(f"--agents: {text!r}: there are no such hyperparameters.{nearest(entries, legal)}")
+        raise ValueError(f"--agents: {text!r}: there are no such hyperparameters.{nearest_name(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
 
 

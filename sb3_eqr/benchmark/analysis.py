@@ -12,6 +12,7 @@ from sb3_eqr.benchmark.reference import SHOWN
 from sb3_eqr.benchmark.tables import aggregate_means, label, number, published, superhuman
 
 N_THRESHOLDS = 81  # of performance profiles
+FEW_RUNS = 5  # below, the percentile bootstrap is far too narrow
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +78,8 @@ def difference_in_words(row: dict, comparison: Comparison) -> str:
     :return: a sentence on whether the runs tell the two agents apart
     """
     agent, other = label(comparison, row["agent"]), label(comparison, row["baseline"])
+    if row["difference"] == 0:
+        return f"{agent} and {other} have the same IQM."
     size = _small(abs(row["difference"]))
     side = "above" if row["difference"] >= 0 else "below"
     if math.isnan(row["detectable"]):
@@ -132,5 +135,11 @@ def notes(analysis: Analysis) -> list[str]:
         verb = "has" if len(single) == 1 else "have"
         found.append(
             f"{', '.join(single)} {verb} a single run per game: no intervals, and no say on what another run would do."
+        )
+    few = [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]
+    if few:
+        found.append(
+            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. A bootstrap of so few is narrower than it should be: "
+            'trust no interval that excludes another by little, and read "What the runs can show".'
         )
     return found

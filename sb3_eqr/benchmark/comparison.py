@@ -9,8 +9,8 @@ import pandas as pd
 
 from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game, read_runs
 from sb3_eqr.benchmark.scores import load_results, score_table
-from sb3_eqr.benchmark.selection import choose_runs, protocol_differences, settings_differences
-from sb3_eqr.benchmark.suites import Suite, read_suite
+from sb3_eqr.benchmark.selection import choose_runs, never_learn, protocol_differences, settings_differences
+from sb3_eqr.benchmark.suites import Suite, nearest_name, read_suite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +101,8 @@ def compare(
     if baseline is not None and baseline not in chosen:
         raise ValueError(f"--baseline: expected one of {', '.join(chosen)}, found {baseline!r}")
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent))
-    notes += settings_differences(results)
     used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
+    notes += [*never_learn(used), *settings_differences(used)]
     differing = protocol_differences(used)
     if differing and not force:
         told = " ".join(f"{agent}: {what}." for agent, what in differing.items())
@@ -150,7 +150,7 @@ def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[st
     """
     there = {result["agent"] for result in results}
     if missing := [agent for agent in agents if agent not in there]:
-        raise ValueError(f"--agents: expected some of {', '.join(sorted(there))}, found {', '.join(missing)}")
+        raise ValueError(f"--agents: {missing[0]!r} has no finished run.{nearest_name(missing[0], there)}")
     return [result for result in results if not agents or result["agent"] in agents]
 
 

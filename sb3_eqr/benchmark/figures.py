@@ -6,6 +6,7 @@ to an agent looks the same in all of them, and differs in more than its colour.
 """
 
 import io
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -138,7 +139,7 @@ def profile_figure(
         for ax, by_agent in zip(axes, profiles.values(), strict=True):
             for agent, (value, low, high) in by_agent.items():
                 _curve(ax, thresholds, value, low, high, style[agent], every=max(1, len(thresholds) // 8))
-            ax.set(xlabel=f"{unit} ($\\tau$)", ylim=(-0.02, 1.02), xlim=(thresholds[0], thresholds[-1]))
+            ax.set(xlabel=f"{textwrap.fill(unit, 40)} ($\\tau$)", ylim=(-0.02, 1.02), xlim=(thresholds[0], thresholds[-1]))
         axes[0].set_ylabel("Fraction with score > $\\tau$")
         _letters(axes, list(profiles))
         _legend(figure, {agent: style[agent] for agent in next(iter(profiles.values()))}, columns)
@@ -227,7 +228,7 @@ def efficiency_figure(
         label, whole = axis
         for agent, (value, low, high) in curves.items():
             _curve(ax, fractions[agent] * whole, value, low, high, style[agent])
-        ax.set(xlabel=label, ylabel=f"IQM, {unit}")
+        ax.set(xlabel=label, ylabel=textwrap.fill(f"IQM, {unit}", 32))
         ax.set_xlim(left=0)
         _legend(figure, {agent: style[agent] for agent in curves}, columns)
         return figure

@@ -174,9 +174,11 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
     except ValueError as error:
         raise ValueError(f"reference {name}, {path}: {error} Correct the name or take the game out.") from error
     missing = [game for game in games if game not in matched.values()]
+    unused = [given for given, game in matched.items() if game not in games]
     if missing:
         raise ValueError(
-            f"reference {name}, {path}: expected scores for {', '.join(games)}, found none for {', '.join(missing)}. "
+            f"reference {name}, {path}: expected scores for {', '.join(games)}, found none for {', '.join(missing)}"
+            f"{f' (not needed: {chr(44).join(unused)})' if unused else ''}. "
             "Add them or report without this reference."
         )
     wanted = {game: content[given] for given, game in matched.items() if game in games}

@@ -28,6 +28,7 @@ def write_report(
     output: pathlib.Path,
     agents: Sequence[str] = (),
     baseline: str | None = None,
+    command: str = "",
     reps: int = REPS,
 ) -> pathlib.Path:
     """
@@ -39,6 +40,7 @@ def write_report(
     :param output: folder to write into; it is made if there is none
     :param agents: those to compare; none: all
     :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first
+    :param command: that wrote it
     :param reps: bootstrap samples behind every interval
     :return: the path of report.html
     :raises ValueError: where nothing can be compared, or comparing would mislead; the message says what to do
@@ -62,7 +64,7 @@ def write_report(
     content.append(("Scores per game", to_html(table) + sections.bullets(sections.game_table_notes(analysis))))
     if comparison.human:
         content.append(("Published last rows", sections.published_rows()))
-    content.append(("Settings", sections.settings(comparison)))
+    content.append(("Settings", sections.settings(comparison, command)))
     title = f"Benchmark {comparison.suite}"
     page = sections.page(title, sections.lead(comparison), [*notes(analysis), *without], content)
     files["report.html"] = page.encode()  # last: who finds it finds the rest

@@ -162,6 +162,7 @@ class RunCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.first_step, self.first_second = self.num_timesteps, self.record["training_seconds"]
+        self.note_progress()
 
     def _on_rollout_start(self) -> None:
         if time.monotonic() - self.saved >= self.settings.checkpoint_seconds:
@@ -187,6 +188,7 @@ class RunCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.clock.read("training_seconds")
+        self.note_progress()
 
     def is_due(self) -> bool:
         """

@@ -40,8 +40,8 @@ def make_table(runs: list[Run], states: list[State]) -> Table:
         cells = [f"{counts['done']}/{len(rows)}", *(str(counts[key] or "") for key in ("running", "waiting", "failed"))]
         table.add_row(name, *cells, f"{share:.0%}", f"{rate:.0f}" if rate else "")
     left = seconds_left(runs, states)
-    if left is not None and left > 0:
-        table.caption = f"about {datetime.timedelta(seconds=round(left))} left"
+    if left is not None:
+        table.caption = f"about {datetime.timedelta(seconds=round(left))} left" if left >= 1 else "in the last evaluations"
     return table
 
 
@@ -108,6 +108,7 @@ def run_benchmark(
         console.print(f"{len(runs) - len(waiting)} of {len(runs)} runs are finished already.")
     if not waiting:
         return []
+    console.print("Connecting to Ray ..." if address else "Starting Ray ...")
     ray = start_ray(address)
     try:
         task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=0)(execute)

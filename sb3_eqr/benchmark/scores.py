@@ -42,5 +42,9 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
 
     :param folder: of the benchmark
     :return: see :func:`score_table`
+    :raises ValueError: for a folder without finished runs
     """
-    return score_table(load_results(pathlib.Path(folder)))
+    results = load_results(pathlib.Path(folder))
+    if not results:
+        raise ValueError(f"{folder}: expected the folder of a benchmark, found no finished run in it")
+    return score_table(results)

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import importlib.metadata
 import json
 import pathlib
 from collections.abc import Iterable, Sequence
@@ -112,7 +113,8 @@ def differences(analysis: Analysis) -> str:
         f"Differences of the IQM, each agent against {label(analysis.comparison, against[0])}, the first of the benchmark"
         + (f", and against {label(analysis.comparison, against[1])}, the best. " if len(against) > 1 else ". ")
         + "A difference counts if it is larger than what the runs can show: the half-width of a 95% interval around no "
-        "difference, by the spread that the stratified bootstrap finds. Of twenty pairs that are alike, about one passes by "
+        "difference, by the spread that the stratified bootstrap finds, times n / (n - 1) for n runs, and Student's quantile. "
+        "Of twenty pairs that are alike, about one passes by "
         "chance; more where one of the two was chosen for its score, as the best is."
     )
     parts = [paragraph(text), bullets(difference_in_words(row, analysis.comparison) for row in rows)]
@@ -160,11 +162,15 @@ def published_rows() -> str:
     return paragraph(text) + bullets(disagreements(rows)) + to_html(table)
 
 
-def settings(comparison: Comparison) -> str:
-    """What each agent ran with, where, and the commands to repeat it."""
+def settings(comparison: Comparison, command: str) -> str:
+    """
+    What each agent ran with, where, and the commands to repeat it.
+
+    :param command: of this report
+    """
     by_agent = {a: [r for r in comparison.results if r["agent"] == a] for a in comparison.agents}
     runs = Table(
-        ["agent", "seeds", "device", "threads", "hours per run", "steps/s", "restarted runs"],
+        ["agent", "seeds", "device", "threads", "minutes per run", "steps/s", "restarted runs"],
         [_run_row(label(comparison, agent), results) for agent, results in by_agent.items()],
     )
     names = [label(comparison, agent) for agent in by_agent]
@@ -176,8 +182,16 @@ def settings(comparison: Comparison) -> str:
     ):
         values = [[_at(result, path) for result in results] for results in by_agent.values()]
         parts += [f"<h3>{heading}</h3>", to_html(_side_by_side(names, values))]
-    commands = "\n".join(dict.fromkeys(result["command"] for result in comparison.results))
-    parts += ["<h3>To repeat it</h3>", f'<div class="box" tabindex="0"><pre>{html.escape(commands)}</pre></div>']
+        if heading == "Hyperparameters":
+            parts.append(
+                paragraph("Where games differ, all values are named; – is an algorithm's default, or no argument of it.")
+            )
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("rliable", "numpy", "scipy", "pandas"))
+    commands = dict.fromkeys(result["command"] for result in comparison.results)
+    whole = [text for text in commands if "--suite" in text] or list(commands)  # not those that only went on
+    lines = html.escape("\n".join([*whole, command]))
+    parts += ["<h3>To repeat it</h3>", f'<div class="box" tabindex="0"><pre>{lines}</pre></div>']
+    parts.append(paragraph(f"suite.yml and run.json in the folder hold what the files named there said. Report: {versions}."))
     return "\n".join(parts)
 
 
@@ -191,13 +205,13 @@ def _run_row(name: str, results: list[dict[str, Any]]) -> list[Cell]:
     def all_of(values: Iterable[Any]) -> str:
         return ", ".join(dict.fromkeys(map(str, values)))
 
-    hours = float(np.mean([result["wall_clock_s"] for result in results])) / 3_600
+    minutes = float(np.mean([result["wall_clock_s"] for result in results])) / 60
     return [
         Cell(name),
         Cell(all_of(sorted({result["seed"] for result in results}))),
         Cell(all_of(f"{result['machine']['device']}, {result['machine'].get('platform', '')}" for result in results)),
         Cell(all_of(result["machine"]["threads"] for result in results)),
-        Cell(number(hours)),
+        Cell(number(minutes)),
         Cell(number(float(np.mean([result["steps_per_second"] for result in results])))),
         Cell(str(sum(bool(result["resumed_at"]) or result["attempts"] > 1 for result in results))),
     ]

@@ -62,6 +62,19 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     return [f"{agent}: its runs do not all have the same {', '.join(sorted(keys))}." for agent, keys in found.items()]
 
 
+def never_learn(results: list[dict[str, Any]]) -> list[str]:
+    """
+    :param results: of runs, or descriptions of runs to come
+    :return: a sentence for every agent that makes no update before its training is over
+    """
+    found: dict[str, dict[str, None]] = {}
+    for result in results:
+        starts, steps = result["entry"]["hyperparameters"].get("learning_starts", 0), result["protocol"]["steps"]
+        if starts >= steps:
+            found.setdefault(result["agent"], {})[f"{result['game']} (learning_starts {starts:,} of {steps:,} steps)"] = None
+    return [f"{agent} learns nothing on {', '.join(where)}: it stays as it was made." for agent, where in found.items()]
+
+
 def choose_runs(
     results: list[dict[str, Any]], suite_games: list[str], force: bool
 ) -> tuple[list[str], dict[str, list[int]], list[str]]:

@@ -53,7 +53,7 @@ class Suite:
         }
 
 
-def nearest(name: str, legal: Iterable[str]) -> str:
+def nearest_name(name: str, legal: Iterable[str]) -> str:
     """
     :return: the end of a message: the nearest legal name and all of them
     """
@@ -68,7 +68,7 @@ def check_keys(where: str, found: Iterable[str], legal: set[str], needed: set[st
     """
     for key in found:
         if key not in legal:
-            raise ValueError(f"{where}: unknown key {key!r}.{nearest(key, legal)}")
+            raise ValueError(f"{where}: unknown key {key!r}.{nearest_name(key, legal)}")
     if missing := needed - set(found):
         raise ValueError(f"{where}: expected the keys {', '.join(sorted(needed))}, found no {', '.join(sorted(missing))}")
 
@@ -159,7 +159,9 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
             raise ValueError(f"{file}: expected suites by name, found {type(own).__name__}. See docs/benchmark.md.")
         entries |= {key: (file, entry) for key, entry in own.items()}
     if name not in entries:
-        raise ValueError(f"suite: {name!r} is none.{nearest(name, entries)}")
+        raise ValueError(
+            f"--suite: there is no suite {name!r}.{nearest_name(name, entries)} A file with your own: --suite-file FILE."
+        )
     path, entry = entries[name]
     return make_suite(name, path.name, entry)
 
@@ -176,7 +178,7 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         by_name = {game.lower(): game for game in suite.games}
         for game in games:
             if game.lower() not in by_name:
-                raise ValueError(f"--games: suite {suite.name!r} has no game {game!r}.{nearest(game, suite.games)}")
+                raise ValueError(f"--games: suite {suite.name!r} has no game {game!r}.{nearest_name(game, suite.games)}")
         kept = {game.lower() for game in games}
         suite = dataclasses.replace(suite, games=[game for game in suite.games if game.lower() in kept])
     if steps is not None:
@@ -186,7 +188,7 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
-                f'{nearest(env_id, gym.registry).split(" There are")[0]} For Atari: pip install "sb3-eqr[atari]".'
+                f'{nearest_name(env_id, gym.registry).split(" There are")[0]} For Atari: pip install "sb3-eqr[atari]".'
             )
     return suite
 

@@ -3,7 +3,7 @@
 import dataclasses
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -199,6 +199,17 @@ def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.
     return means if len(means) == len(comparison.games) else none
 
 
+def best(values: Mapping[str, float], comparison: Comparison) -> set[str]:
+    """
+    :param values: agent -> the higher the better
+    :return: the agents to print in bold: none where all are alike, and none whose protocol is not that of the others
+    """
+    if len(set(values.values())) < 2:
+        return set()
+    top = max(values.values())
+    return {agent for agent, value in values.items() if value == top and agent not in comparison.differing}
+
+
 def game_table(
     comparison: Comparison, aggregates: pd.DataFrame, matrices: dict[str, np.ndarray], means: pd.DataFrame
 ) -> Table:
@@ -210,17 +221,18 @@ def game_table(
     :param means: of :func:`published`
     """
     agents = list(matrices)
-    low, high = (RANDOM, HUMAN) if comparison.human else ("score 0", "score 1")
-    header = ["game", low, high, *(label(comparison, agent) for agent in agents), *(f"{name} †" for name in means)]
+    names = (RANDOM, HUMAN) if comparison.human else ("score 0", "score 1")
+    header = ["game", *names, *(label(comparison, agent) for agent in agents), *(f"{name} †" for name in means)]
     by_game = comparison.scores.groupby(["agent", "game"])["raw"].agg(["mean", "std"])
     rows = []
     for game in comparison.games:
         row = [Cell(game), *(Cell(number(bound)) for bound in comparison.bounds[game])]
-        best = max((by_game.at[(agent, game), "mean"] for agent in agents), key=lambda raw: comparison.normalize(game, raw))
+        low, high = comparison.bounds[game]
+        bold = best({agent: by_game.at[(agent, game), "mean"] * np.sign(high - low) for agent in agents}, comparison)
         for agent in agents:
             mean, spread = by_game.loc[(agent, game)]
             aside = "" if np.isnan(spread) else f"± {number(spread, decimals_of(mean))}"
-            row.append(Cell(number(mean), bold=len(agents) > 1 and mean == best, aside=aside))
+            row.append(Cell(number(mean), bold=agent in bold, aside=aside))
         rows.append(row + [Cell(number(means.at[game, method])) for method in means])
     return Table(header, rows + _aggregate_rows(comparison, aggregates, matrices, means), ruled=(len(rows),))
 
@@ -250,14 +262,15 @@ def _aggregate_rows(
     for metric in METRICS:
         bounds = (1.0, 0.0) if metric == "optimality gap" else (0.0, 1.0)
         values = {agent: by_agent.at[(agent, metric), "value"] for agent in matrices}
-        best = (min if metric == "optimality gap" else max)(values.values())
+        bold = best({a: -value if metric == "optimality gap" else value for a, value in values.items()}, comparison)
         row = [Cell(metric), *(Cell(number(bound, 3)) for bound in bounds)]
         for agent, value in values.items():
             ends = interval(*by_agent.loc[(agent, metric), ["low", "high"]])
-            row.append(Cell(number(value, 3), bold=len(values) > 1 and value == best, aside=ends))
+            row.append(Cell(number(value, 3), bold=agent in bold, aside=ends))
         rows.append(row + [Cell(number(of_means[method, metric], 3)) for method in means])
     counts = {agent: games_above(matrix) for agent, matrix in matrices.items()}
     row = [Cell(superhuman(comparison)), Cell("0"), Cell("–")]  # nothing is above itself
-    row += [Cell(str(n), bold=len(counts) > 1 and n == max(counts.values())) for n in counts.values()]
+    bold = best(counts, comparison)
+    row += [Cell(str(n), bold=agent in bold) for agent, n in counts.items()]
     row += [Cell(str(int(of_means[method, "above 1"]))) for method in means]
     return [*rows, row]

@@ -36,10 +36,10 @@ DOWNLOADS = "rl-trained-agents"  # where enjoy looks, and puts what it downloads
 # What the extra brings.
 EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
-USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)}}} ...
+USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark}} ...
 
-Every command takes RL Zoo's arguments: sb3-eqr train --help
-Comparisons of agents over games and seeds: sb3-eqr benchmark --help
+Every command but benchmark takes RL Zoo's arguments: sb3-eqr train --help
+benchmark compares agents over games and seeds: sb3-eqr benchmark --help
 push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
 
 
