@@ -112,8 +112,8 @@ def _improvements(analysis: Analysis, style: dict[str, figures.Look]) -> list[Pi
     for column in ("agent", "baseline"):
         rows[column] = [label(analysis.comparison, agent) for agent in rows[column]]
     caption = (
-        f"How likely a run of an agent scores higher than one of {rows['baseline'].iloc[0]}, averaged over games. That is "
-        f"the first agent of the benchmark, a stock one where there is any.{_intervals_are(analysis, 'Bars are')}"
+        f"How likely a run of an agent scores higher than one of {rows['baseline'].iloc[0]}, the baseline (--baseline, or the "
+        f"first stock agent), averaged over games.{_intervals_are(analysis, 'Bars are')}"
     )
     draw = partial(figures.improvement_figure, rows, style)
     return [Picture("improvement", "Probability of improvement", caption, draw)]

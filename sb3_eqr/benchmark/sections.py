@@ -110,7 +110,7 @@ def differences(analysis: Analysis) -> str:
     rows = analysis.differences.to_dict("records")
     against = [analysis.baseline, *([analysis.best] if analysis.best != analysis.baseline else [])]
     text = (
-        f"Differences of the IQM, each agent against {label(analysis.comparison, against[0])}, the first of the benchmark"
+        f"Differences of the IQM, each agent against {label(analysis.comparison, against[0])}, the baseline"
         + (f", and against {label(analysis.comparison, against[1])}, the best. " if len(against) > 1 else ". ")
         + "A difference counts if it is larger than what the runs can show: the half-width of a 95% interval around no "
         "difference, by the spread that the stratified bootstrap finds, times n / (n - 1) for n runs, and Student's quantile. "
