@@ -1,7 +1,6 @@
 """Suites: the games, steps, preprocessing, evaluation protocol and normalisation of a benchmark."""
 
 import dataclasses
-import difflib
 import pathlib
 from collections.abc import Iterable
 from typing import Any
@@ -13,6 +12,7 @@ from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.zoo.checks import nearest
 
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
 EVALUATION = {"episodes", "n_envs", "epsilon", "max_steps", "preprocessing", "curve"}
@@ -58,8 +58,7 @@ def nearest_name(name: str, legal: Iterable[str]) -> str:
     :return: the end of a message: the nearest legal name and all of them
     """
     names = sorted(legal)
-    found = difflib.get_close_matches(name, names, n=1)
-    return f"{f' Did you mean {found[0]!r}?' if found else ''} There are {', '.join(names)}."
+    return f"{nearest(name, names)} There are {', '.join(names)}."
 
 
 def check_keys(where: str, found: Iterable[str], legal: set[str], needed: set[str]) -> None:
@@ -188,7 +187,7 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
-                f'{nearest_name(env_id, gym.registry).split(" There are")[0]} For Atari: pip install "sb3-eqr[atari]".'
+                f'{nearest(env_id, gym.registry)} For Atari: pip install "sb3-eqr[atari]".'
             )
     return suite
 
