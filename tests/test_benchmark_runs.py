@@ -10,12 +10,13 @@ from filelock import FileLock
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr.benchmark import run as run_module
+from sb3_eqr.benchmark import recording
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.checkpoints import find_checkpoints, pickle_environment, restore_environment
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
-from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings, execute
+from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.benchmark.training import execute
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 
@@ -64,14 +65,14 @@ def scores_of(run):
 def stop_at(monkeypatch, *steps):
     """Training stops with an exception when it first comes to each of these steps."""
     ahead = list(steps)
-    on_step = run_module.RunCallback._on_step
+    on_step = recording.RunCallback._on_step
 
     def step_or_stop(self):
         if ahead and self.num_timesteps >= ahead[0]:
             raise KeyError(f"stopped at {ahead.pop(0)}")
         return on_step(self)
 
-    monkeypatch.setattr(run_module.RunCallback, "_on_step", step_or_stop)
+    monkeypatch.setattr(recording.RunCallback, "_on_step", step_or_stop)
 
 
 @pytest.mark.parametrize("algo", AGENTS)
@@ -210,7 +211,7 @@ def test_a_run_that_another_process_has_is_left_alone(tmp_path):
 def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monkeypatch):
     undisturbed, full = make_run(tmp_path / "undisturbed", "qrdqn"), make_run(tmp_path / "full", "qrdqn")
     execute(undisturbed, Settings())
-    save, calls = run_module.write_checkpoint, []
+    save, calls = recording.write_checkpoint, []
 
     def no_space_at_the_fifth(folder, model, record, is_final=False):
         calls.append(model.num_timesteps)
@@ -222,7 +223,7 @@ def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monk
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(run_module, "write_checkpoint", no_space_at_the_fifth)
+    monkeypatch.setattr(recording, "write_checkpoint", no_space_at_the_fifth)
     with monkeypatch.context(), pytest.raises(OSError, match="No space left"):
         execute(full, Settings(checkpoint_seconds=0.0))
     assert [path.name for path in full.folder.glob("*checkpoint*")] == [f"checkpoint-{calls[3]:012d}"]
@@ -285,11 +286,11 @@ def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
         execute(run, Settings(checkpoint_seconds=0.0))
     counts = []
     monkeypatch.setattr(
-        run_module.RunCallback,
+        recording.RunCallback,
         "_on_training_start",
         lambda self: counts.append(self.model.get_vec_normalize_env().obs_rms.count),
     )
-    monkeypatch.setattr(run_module.RunCallback, "note_progress", lambda self: None)
+    monkeypatch.setattr(recording.RunCallback, "note_progress", lambda self: None)
     execute(run, Settings())
     assert counts == [pytest.approx(192, abs=20)]  # what it knew of the observations' scale
     result = result_of(run)

@@ -14,7 +14,8 @@ from rich.live import Live
 from rich.table import Table
 
 from sb3_eqr.benchmark.plan import State, seconds_left, state_of
-from sb3_eqr.benchmark.run import ERROR, Run, Settings, execute
+from sb3_eqr.benchmark.run import ERROR, Run, Settings
+from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.safe_files import atomic_write
 
 ATTEMPTS = 2  # a run that crashes is retried once
