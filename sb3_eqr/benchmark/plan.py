@@ -1,5 +1,6 @@
 """What a benchmark is to run, and where it stands: folders of runs, the same for every process that looks at them."""
 
+import dataclasses
 import json
 import pathlib
 from typing import Any, NamedTuple
@@ -97,12 +98,10 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
         old = read_suite(path)
         if old.name != suite.name:
             raise ValueError(f"{folder}: expected a benchmark of suite {suite.name!r}, found one of {old.name!r}")
-        old_games = [game for game in old.games if game not in suite.games]
-        suite.games[:0] = old_games
-        for game in old_games:
-            suite.steps[game] = old.steps[game]
-            if game in old.normalisation["scores"]:
-                suite.normalisation["scores"][game] = old.normalisation["scores"][game]
+        games = [*old.games, *(game for game in suite.games if game not in old.games)]
+        scores = old.normalisation["scores"] | suite.normalisation["scores"]
+        normalisation = suite.normalisation | {"scores": scores}
+        suite = dataclasses.replace(suite, games=games, steps=old.steps | suite.steps, normalisation=normalisation)
     write_suite(suite, path)
     for run in runs:
         run.folder.mkdir(parents=True, exist_ok=True)

@@ -138,6 +138,7 @@ def execute(run: Run, settings: Settings) -> str:
     try:
         with FileLock(run.folder / LOCK, blocking=False):
             if (run.folder / RESULT).is_file():
+                remove_checkpoints(run.folder)  # of a process that was killed at the very end
                 return "finished"
             th.set_num_threads(settings.n_threads)
             try:
