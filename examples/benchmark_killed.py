@@ -64,7 +64,7 @@ def main() -> None:
 
     killed = args.folder / "killed"
     for kill in range(1, args.kills + 1):
-        wait = rng.uniform(0.1, 0.5) * seconds
+        wait = rng.uniform(0.1, 0.3) * seconds
         process = start(killed)
         try:
             process.wait(wait)
