@@ -163,6 +163,14 @@ def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
     assert code == 2 and 'benchmark run needs Ray: pip install "sb3-eqr[benchmark]"' in out.err
 
 
+def test_the_script_without_its_extra(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", "status", "b"])
+    monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.__main__", raising=False)
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    with pytest.raises(SystemExit, match=r'sb3-eqr: .*rich.*pip install "sb3-eqr\[benchmark\]" brings it'):
+        cli.main()
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
