@@ -195,9 +195,26 @@ class SequenceReplayBuffer(ReplayBuffer):
         """
         if self.prediction_depth == 0:
             return super().sample(batch_size, env)  # type: ignore[return-value]
+        return self._get_samples(self._positions(np.random.randint(0, self.n_starts, size=batch_size)), env)
+
+    @property
+    def n_starts(self) -> int:
+        """How many steps have a whole window behind them, per environment."""
+        return self.size() - self.window + 1
+
+    def windows(self, starts: np.ndarray, envs: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
+        """
+        The windows of one's own choice.
+
+        :param starts: steps, 0 is the oldest stored, below ``n_starts``, (B,)
+        :param envs: environments, (B,)
+        :param env: normalises observations and one-step rewards, where given
+        """
+        return self._gather(self._positions(starts), envs, env)
+
+    def _positions(self, starts: np.ndarray) -> np.ndarray:
         oldest = self.pos if self.full else 0
-        ages = np.random.randint(0, self.size() - self.window + 1, size=batch_size)
-        return self._get_samples((oldest + ages) % self.buffer_size, env)
+        return (oldest + starts) % self.buffer_size
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
         env_indices = np.random.randint(0, self.n_envs, size=batch_inds.shape)

@@ -1,0 +1,297 @@
+"""The latent states of an agent on windows of play: what every diagnostic, picture and animation looks at."""
+
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
+
+from sb3_eqr.common.buffers import SequenceReplayBuffer
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.groups import SE, SO, Group, MatrixLieGroup, NoGroup, ProductGroup, T
+from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
+
+CHUNK = 256  # observations encoded at once
+# What an environment tells of its true state, under these keys of ``info``; the worlds of sb3_eqr.envs do.
+FACTOR_KEYS = ("position", "angle", "velocity", "translation")
+
+
+class Play(NamedTuple):
+    """Windows of play: N starts, M steps ahead of each."""
+
+    samples: SequenceReplayBufferSamples
+    factors: np.ndarray | None  # (N, F): the true state at each start, where the environment's ``info`` tells it
+
+
+class Latents(NamedTuple):
+    """Latent states of N windows. D = K · prod(element_shape)."""
+
+    states: th.Tensor  # (N, D): x₀ = τ(s_t)
+    next_states: th.Tensor  # (N, M, D): x₁ ... x_M, encoded
+    predicted: th.Tensor  # (N, M, D): x̂₁ ... x̂_M, rolled out from x₀
+    predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m); the sign's expectation where the reward loss is categorical
+    actions: th.Tensor  # (N, M), int64
+    rewards: th.Tensor  # (N, M)
+    mask: th.Tensor  # (N, M): 1 where the episode had not ended before step t+m
+
+
+class Blocks(NamedTuple):
+    """Blocks of one group."""
+
+    group: Group
+    elements: th.Tensor  # (..., K, *element_shape)
+
+
+def play(
+    model: EqRAlgorithm, env: VecEnv, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
+) -> Play:
+    """
+    Let the agent play, and cut the play into windows. NumPy's and torch's global generators are left as they were.
+
+    :param model: any EqR agent
+    :param env: with the agent's observations and actions, preprocessed as in training
+    :param n_steps: over all environments, at least 2 · depth + 2 each
+    :param depth: M ≥ 1, how many steps each window looks ahead
+    :param deterministic: whether the agent acts without noise; else as it explores
+    :param seed: of the environment and of the agent's noise
+    :return: every window that was complete, in order
+    :raises ValueError: if there are too few steps
+    """
+    check_number("depth", depth, 1, whole=True)
+    check_number("n_steps", n_steps, (2 * depth + 2) * env.num_envs, whole=True)
+    buffer = SequenceReplayBuffer(
+        n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
+    )
+    factors: list[np.ndarray | None] = []
+    state = th.get_rng_state(), np.random.get_state()
+    th.manual_seed(seed)
+    np.random.seed(seed)
+    try:
+        env.seed(seed)
+        obs: Any = env.reset()
+        infos: list[dict[str, Any]] = env.reset_infos
+        for _ in range(buffer.buffer_size):
+            factors.append(_factors(infos))
+            actions, _ = model.predict(obs, deterministic=deterministic)  # type: ignore[arg-type]
+            new_obs, rewards, dones, infos = env.step(actions)
+            buffer.add(obs, _true_next(new_obs, dones, infos), actions, rewards, dones, infos)
+            infos = [env.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
+            obs = new_obs
+    finally:
+        th.set_rng_state(state[0])
+        np.random.set_state(state[1])
+    starts, envs = (grid.ravel() for grid in np.meshgrid(np.arange(buffer.n_starts), np.arange(env.num_envs), indexing="ij"))
+    samples = buffer.windows(starts, envs, model.get_vec_normalize_env())
+    known = all(found is not None for found in factors)
+    return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
+
+
+def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> Play:
+    """
+    Windows from the agent's own replay buffer, drawn uniformly; no global generator is used.
+
+    :param model: an agent in training, with ``prediction_depth`` ≥ 1
+    :param n_windows: N
+    :param rng: draws them
+    """
+    buffer = model.replay_buffer
+    assert buffer is not None and buffer.prediction_depth > 0
+    starts = rng.integers(0, buffer.n_starts, n_windows)
+    envs = rng.integers(0, buffer.n_envs, n_windows)
+    return Play(buffer.windows(starts, envs, model.get_vec_normalize_env()), None)
+
+
+def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
+    """
+    x = τ(s), by the online encoder in eval mode.
+
+    :param model: any EqR agent
+    :param observations: as the replay buffer has them, (N, *obs_shape) or a dict of these
+    :return: (N, D), without gradient
+    """
+    n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    pieces = []
+    with th.no_grad(), _eval_mode(model):
+        for start in range(0, n, CHUNK):
+            piece = _map(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
+            pieces.append(model.policy.online.features(piece))
+    return th.cat(pieces)
+
+
+def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latents:
+    """
+    :param model: any EqR agent
+    :param samples: N windows with rollouts, M ≥ 1
+    :return: without gradient, on the agent's device
+    """
+    assert samples.mask is not None and samples.rollout_actions is not None and samples.rollout_rewards is not None
+    assert samples.rollout_observations is not None
+    mask = samples.mask.to(model.device)
+    actions = (samples.rollout_actions.to(model.device) * mask.long()).long()
+    states = encode(model, samples.observations)
+    following = encode(model, _map(samples.rollout_observations, lambda obs: obs.flatten(0, 1)))
+    latent_model = model.policy.latent_model
+    with th.no_grad(), _eval_mode(model):
+        one_hot = F.one_hot(actions, latent_model.n_actions).to(states.dtype)
+        predicted = latent_model.rollout(states, one_hot, mask)
+        outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
+        if outputs.shape[1] == 3:
+            outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
+    return Latents(
+        states,
+        following.unflatten(0, mask.shape),
+        predicted,
+        outputs.view(mask.shape),
+        actions,
+        samples.rollout_rewards.to(model.device),
+        mask,
+    )
+
+
+def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
+    """
+    κ(x, a) of every action in every state.
+
+    :param states: (N, D)
+    :return: (N, A, K, *element_shape), without gradient
+    """
+    latent_model = model.policy.latent_model
+    n, n_actions = len(states), latent_model.n_actions
+    one_hot = th.eye(n_actions, dtype=states.dtype, device=states.device).repeat(n, 1)  # (N * A, A)
+    with th.no_grad(), _eval_mode(model):
+        return latent_model.action_element(states.repeat_interleave(n_actions, dim=0), one_hot).unflatten(0, (n, n_actions))
+
+
+def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
+    """
+    :param states: flat, (..., D), or elements, (..., K, *element_shape)
+    :return: the blocks, one entry per group: a product's factors one by one
+    """
+    latent_model = model.policy.latent_model
+    group, shape = latent_model.group, latent_model.group.element_shape
+    if states.ndim > len(shape) and states.shape[-len(shape) - 1 :] == (latent_model.n_blocks, *shape):
+        elements = states
+    else:
+        elements = states.unflatten(-1, (latent_model.n_blocks, *shape))
+    if not isinstance(group, ProductGroup):
+        return [Blocks(group, elements)]
+    sizes = [count * prod(factor.element_shape) for factor, count in group.factors]
+    pieces = elements.split(sizes, dim=-1)  # (..., K, count * prod(element_shape))
+    found = []
+    for (factor, count), piece in zip(group.factors, pieces, strict=True):
+        blocks = piece.unflatten(-1, (count, *factor.element_shape))  # (..., K, count, *element_shape)
+        found.append(Blocks(factor, blocks.flatten(-2 - len(factor.element_shape), -1 - len(factor.element_shape))))
+    return found
+
+
+def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
+    """
+    An element as a moving frame: what turns (or shears), and what shifts.
+
+    :param elements: (..., *element_shape)
+    :return: a matrix, (..., n, n), or ``None``; a vector, (..., n), or ``None``
+    """
+    if isinstance(group, (T, NoGroup)):
+        return None, elements
+    if isinstance(group, SE) or _is_affine(group):
+        return elements[..., :-1, :-1], elements[..., :-1, -1]
+    return elements, None
+
+
+def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
+    """
+    An element in numbers that are 0 at the identity: the angles of a rotation's logarithm, radians in (-π, π], one per
+    plane i < j; the entries less the identity's where the matrix is no rotation; then the translation.
+
+    :param elements: (..., *element_shape)
+    :return: (..., C), C = len(coordinate_names(group))
+    """
+    matrix, vector = frame(group, elements)
+    parts = []
+    if matrix is not None and isinstance(group, (SO, SE)):
+        parts.append(_rotation_log(matrix))
+    elif matrix is not None:
+        parts.append((matrix - th.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)).flatten(-2))
+    if vector is not None:
+        parts.append(vector)
+    return th.cat(parts, dim=-1)
+
+
+def coordinate_names(group: Group) -> list[str]:
+    """
+    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...
+    """
+    matrix, vector = frame(group, th.zeros(group.element_shape))
+    names = []
+    if matrix is not None:
+        n = matrix.shape[-1]
+        rotation = isinstance(group, (SO, SE))
+        pairs = [(i, j) for i in range(n) for j in range(n) if i < j or not rotation]
+        names = [f"{'angle' if rotation else 'a'} {i}-{j}" for i, j in pairs]
+    return names + ([] if vector is None else [f"t {i}" for i in range(vector.shape[-1])])
+
+
+def _rotation_log(rotation: th.Tensor) -> th.Tensor:
+    """
+    :param rotation: (..., n, n)
+    :return: the upper triangle of its logarithm, (..., n(n-1)/2)
+    """
+    if rotation.shape[-1] == 2:
+        return th.atan2(rotation[..., 0, 1] - rotation[..., 1, 0], rotation[..., 0, 0] + rotation[..., 1, 1])[..., None]
+    values, vectors = th.linalg.eig(rotation.to(th.float64))  # a rotation is normal: its eigenvectors are a basis
+    log = (vectors * (1j * values.angle())[..., None, :] @ th.linalg.inv(vectors)).real
+    i, j = th.triu_indices(rotation.shape[-1], rotation.shape[-1], 1)
+    return log[..., i, j].to(rotation.dtype)
+
+
+def _is_affine(group: Group) -> bool:
+    """Whether every element's last row is 0 ... 0 1."""
+    return isinstance(group, MatrixLieGroup) and group.element_shape[0] > 1 and not group.generators[:, -1].any()
+
+
+def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
+    """
+    :return: (n_envs, F); ``None`` where an environment does not tell
+    """
+    found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
+    return np.array([np.concatenate(row) for row in found]) if all(found) else None
+
+
+def _true_next(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+    """The terminal observation where an episode has ended."""
+    if isinstance(new_obs, dict):
+        return {
+            key: _true_next(
+                obs, dones, [{**i, "terminal_observation": i.get("terminal_observation", {}).get(key)} for i in infos]
+            )
+            for key, obs in new_obs.items()
+        }
+    result = new_obs.copy()
+    for i, done in enumerate(dones):
+        if done:
+            result[i] = infos[i]["terminal_observation"]
+    return result
+
+
+def _map(observations: PyTorchObs, function) -> Any:
+    if isinstance(observations, dict):
+        return {key: function(obs) for key, obs in observations.items()}
+    return function(observations)
+
+
+class _eval_mode:
+    """The policy in eval mode while this lasts, then as it was."""
+
+    def __init__(self, model: EqRAlgorithm):
+        self._modules = [(module, module.training) for module in model.policy.modules()]
+
+    def __enter__(self) -> None:
+        for module, _ in self._modules:
+            module.training = False
+
+    def __exit__(self, *args: object) -> None:
+        for module, training in self._modules:
+            module.training = training
