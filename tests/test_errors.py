@@ -26,7 +26,7 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"policy_kwargs": {"n_blocks": 0}}, "n_blocks: expected a whole number of at least 1, found 0"),
         ({"policy_kwargs": {"n_blocks": 2.5}}, "n_blocks"),
         ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization: expected one of"),
-        ({"policy_kwargs": {"net_arch": []}}, "at least one hidden layer.*shared_projection"),
+        ({"policy_kwargs": {"net_arch": []}}, "at least one hidden layer.*projection"),
         ({"policy_kwargs": {"group": "none"}}, "Pass get_coef=0"),
         ({"prediction_depth": -1}, "prediction_depth: expected a whole number of at least 0, found -1"),
         ({"prediction_depth": 1.5}, "prediction_depth"),

@@ -217,9 +217,9 @@ def test_beta_may_fall(make):
 # ---------------------------------------------------------------------------------------------- resets
 
 
-@pytest.mark.parametrize("alpha, shared_projection", [(0.5, True), (0.2, False), (0.0, True), (1.0, True)])
-def test_a_reset_to_the_last_bit(make, alpha, shared_projection):
-    network = {"shared_projection": shared_projection}
+@pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
+def test_a_reset_to_the_last_bit(make, alpha, projection):
+    network = {"projection": projection}
     model = make(ChainEnv(), reset_interval=60, reset_shrink_factor=alpha, tau=0.1, policy_kwargs=network).learn(70)
     assert model._n_updates == 60 and model._resets == []  # the next update comes after a reset
     old = {name: p.clone() for name, p in model.policy.state_dict().items()}

@@ -61,7 +61,7 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
         {"target_update_interval": 30},
         {"policy_kwargs": {"dueling": False}},
         {"policy_kwargs": {"noisy": False}},
-        {"policy_kwargs": {"net_arch": [], "shared_projection": False}},
+        {"policy_kwargs": {"net_arch": [], "projection": "own"}},
         {"policy_kwargs": {"net_arch": []}, "aet_coef": 0},
         {"policy_kwargs": {"group": "GL(2)"}},
         {"policy_kwargs": {"group": "SO(3)", "parameterization": "exp"}},

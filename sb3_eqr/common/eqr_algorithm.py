@@ -114,11 +114,9 @@ class EqRAlgorithm(EqRSetup):
     def _update(self, samples: SequenceReplayBufferSamples) -> None:
         """One gradient step, the target, the priorities."""
         td, auxiliary = self._compute_losses(samples)
-        per_sample = td.loss  # (B,)
-        for coef, part in zip((self.aet_coef, self.get_coef, self.reward_coef), auxiliary, strict=True):
-            if part is not None and coef > 0:
-                per_sample = per_sample + coef * part
-        loss = (samples.weights * per_sample).mean()
+        parts = {"td": None if td is None else td.loss, **auxiliary._asdict()}
+        weighted = [getattr(self, f"{name}_coef") * part for name, part in parts.items() if part is not None]
+        loss = (samples.weights * sum(weighted[1:], weighted[0])).mean()
 
         self.policy.optimizer.zero_grad()
         loss.backward()
@@ -130,40 +128,42 @@ class EqRAlgorithm(EqRSetup):
         if self.target_update_interval is None:
             self.policy.update_target(self.tau)
             self._target_is_copy = self.tau == 1.0
-        if isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
+        if td is not None and isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
             self.replay_buffer.update_priorities(samples.indices, td.priorities)
         with th.no_grad():
-            parts = {"td_loss": td.loss, **{f"{name}_loss": part for name, part in auxiliary._asdict().items()}}
-            figures = {name: part.mean() for name, part in parts.items() if part is not None}
-            self._monitor.add({**figures, "loss": loss, "grad_norm": grad_norm, "mean_q_value": td.q_values.mean()})
+            figures = {f"{name}_loss": part.mean() for name, part in parts.items() if part is not None}
+            figures.update(loss=loss, grad_norm=grad_norm)
+            if td is not None:
+                figures["mean_q_value"] = td.q_values.mean()
+            self._monitor.add(figures)
 
-    def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss, LatentLosses]:
+    def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss | None, LatentLosses]:
         """
         One features pass for s_t serves both; one target pass covers every other observation.
 
-        :return: losses per sample
+        :return: losses per sample; no TD loss where it is off
         """
         policy = self.policy
-        batch_size = len(samples.actions)
         observations = self._augment(samples.observations)
         features = policy.online.features(observations)  # (B, D)
+        others = [samples.next_observations] if self.td_coef > 0 else []
+        n_next = len(samples.actions) if self.td_coef > 0 else 0
+        if samples.rollout_observations is not None and self._uses_aet:
+            others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
         with th.no_grad():
-            others = [samples.next_observations]
-            if samples.rollout_observations is not None and self._uses_aet:
-                others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
-            other_observations = self._augment(_cat(others))
-            other_features = policy.target.features(other_observations)  # (B + B * M, D)
-            next_target = next_online = other_features[:batch_size]
-            if self.double_q and not self._target_is_online:
-                next_online = policy.online.features(_map(lambda obs: obs[:batch_size], other_observations))
-        td = self._q_learning(samples, features, next_online, next_target)
+            other_observations = self._augment(_cat(others)) if others else observations
+            other_features = policy.target.features(other_observations) if others else features[:0]  # (B + B * M, D)
+            next_target = next_online = other_features[:n_next]
+            if n_next and self.double_q and not self._target_is_online:
+                next_online = policy.online.features(_map(lambda obs: obs[:n_next], other_observations))
+        td = self._q_learning(samples, features, next_online, next_target) if n_next else None
         if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
             target_states = features.detach() if self._target_is_online else policy.target.features(observations)
             target_states = target_states[:, None]
             if self._uses_aet:
-                rollout = other_features[batch_size:].unflatten(0, samples.mask.shape)  # (B, M, D)
+                rollout = other_features[n_next:].unflatten(0, samples.mask.shape)  # (B, M, D)
                 target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         auxiliary = policy.latent_model(
             features,

@@ -54,6 +54,8 @@ class EqRArguments(SafeFiles):
         get_coef: float = 1.0,
         reward_coef: float = 1.0,
         reward_loss: str = "mse",
+        aet_loss: str = "distance",
+        td_coef: float = 1.0,
         double_q: bool = True,
         prioritized_replay: bool = True,
         priority_alpha: float = 0.5,
@@ -107,6 +109,10 @@ class EqRArguments(SafeFiles):
         :param get_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
         :param reward_coef: λ₁ ≥ 0, weight of the reward loss; 0 switches it off
         :param reward_loss: "mse" (Eq. 17), or "categorical": cross-entropy over the sign of the reward
+        :param aet_loss: "distance" (Eq. 18), or "contrastive": InfoNCE among the batch's targets
+            (:func:`~sb3_eqr.common.losses.contrastive_loss`), which cannot collapse
+        :param td_coef: weight of the TD loss; 0: no Q-learning, the representation alone is trained
+            (:func:`~sb3_eqr.representation.train_representation`), and replay priorities stay as they are
         :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
         :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
         :param priority_alpha: α, the priority exponent
@@ -175,6 +181,8 @@ class EqRArguments(SafeFiles):
         self.get_coef = get_coef
         self.reward_coef = reward_coef
         self.reward_loss = reward_loss
+        self.aet_loss = aet_loss
+        self.td_coef = td_coef
         self.double_q = double_q
         self.prioritized_replay = prioritized_replay
         self.priority_alpha = priority_alpha
@@ -197,7 +205,7 @@ class EqRArguments(SafeFiles):
             check_number("target_update_interval", self.target_update_interval, 1, whole=True)
         for name in ("prediction_depth", "shift_pixels"):
             check_number(name, getattr(self, name), 0, whole=True)
-        for name in ("aet_coef", "get_coef", "reward_coef", "intensity_scale"):
+        for name in ("td_coef", "aet_coef", "get_coef", "reward_coef", "intensity_scale"):
             check_number(name, getattr(self, name), 0)
         for name in ("tau", "priority_final_beta", "reset_shrink_factor", "reset_fraction"):
             check_number(name, getattr(self, name), 0, 1)
@@ -206,6 +214,10 @@ class EqRArguments(SafeFiles):
             check_number("reset_interval", self.reset_interval, 1, whole=True)
         if self.initial_n_steps is not None:
             check_number("initial_n_steps", self.initial_n_steps, 1, whole=True)
+        check_number("batch_size", self.batch_size, 1, whole=True)
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
         if self.initial_gamma is not None:
             check_number("initial_gamma", self.initial_gamma, 0, 1)
             if max(self.initial_gamma, self.gamma) == 1:
@@ -213,7 +225,11 @@ class EqRArguments(SafeFiles):
                     f"initial_gamma: expected it and gamma below 1, since 1 - γ is annealed by a factor, found "
                     f"{self.initial_gamma} and {self.gamma}. Pass initial_gamma=None for a constant γ."
                 )
-        check_number("batch_size", self.batch_size, 1, whole=True)
+        if self.td_coef == 0 and self.depth == 0:
+            raise ValueError(
+                "td_coef: expected a weight above 0 where no auxiliary loss is on, found 0. "
+                "Pass prediction_depth >= 1 and one of aet_coef, get_coef, reward_coef above 0."
+            )
         if self.depth > 0 and self.batch_size < 2:
             raise ValueError(
                 f"batch_size: the latent model's batch norm needs at least 2 samples, found {self.batch_size}. "

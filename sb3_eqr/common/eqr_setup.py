@@ -79,10 +79,10 @@ class EqRSetup(EqRArguments):
                 f"get_coef: the GET loss needs a group with inverses, found group={self.policy.group!r}. "
                 "Pass get_coef=0 or another group."
             )
-        if self._uses_aet and self.policy.shared_projection and not self.policy.online.net_arch:
+        if self._uses_aet and self.policy.projection == "head" and not self.policy.online.net_arch:
             raise ValueError(
                 "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
-                'Pass policy_kwargs={"net_arch": [256]} or {"shared_projection": False}, or aet_coef=0.'
+                'Pass policy_kwargs={"net_arch": [256]} or {"projection": "own"}, or aet_coef=0.'
             )
         if self.exploration_final_eps == 0 and not self.policy.noisy and self.reset_interval is None:  # resets explore, too
             warnings.warn(
@@ -92,7 +92,7 @@ class EqRSetup(EqRArguments):
 
     @property
     def _all_policy_kwargs(self) -> dict[str, Any]:
-        return {**self.policy_kwargs, "reward_loss": self.reward_loss}
+        return {**self.policy_kwargs, "reward_loss": self.reward_loss, "aet_loss": self.aet_loss}
 
     def _make_policy(self) -> EqRPolicy:
         """A policy as :meth:`_setup_model` builds it, freshly drawn."""

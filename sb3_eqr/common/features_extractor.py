@@ -145,7 +145,9 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
     :param n_blocks: K ≥ 1; ``None``: 12, for T(n) 32 (Table 5), and 1 where the name counts its own blocks
         ("SE(2)^8 x SO(3)^4", "none")
-    :param parameterization: of rotations, "euler" or "exp"
+    :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
+    :param standardize: whether what the trunk says of the algebra is brought to mean 0 and variance 1 over the batch (batch
+        norm without scale and offset), so that states cannot collapse to a point and spread around the identity
     :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
@@ -159,6 +161,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         group: str | Group = DEFAULT_GROUP,
         n_blocks: int | None = None,
         parameterization: str = "euler",
+        standardize: bool = False,
         trunk_class: str | type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
         normalized_image: bool = False,
@@ -178,7 +181,10 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         if is_default or (normalized_image and issubclass(found, ImageExtractor)):
             trunk_kwargs.setdefault("normalized_image", normalized_image)
         self.trunk = found(observation_space, **trunk_kwargs)
-        self.to_algebra = nn.Linear(self.trunk.features_dim, n_blocks * made.num_params)
+        n_params = n_blocks * made.num_params
+        self.to_algebra: nn.Module = nn.Linear(self.trunk.features_dim, n_params)
+        if standardize:
+            self.to_algebra = nn.Sequential(self.to_algebra, nn.BatchNorm1d(n_params, affine=False))
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """

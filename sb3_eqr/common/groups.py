@@ -13,6 +13,7 @@ from functools import cache
 from math import prod
 
 import torch as th
+from torch.nn import functional as F
 
 # An inverse is replaced by its damped form where the condition number exceeds the inverse of this many
 # machine epsilons: beyond it, a plain solve has no correct digit left.
@@ -70,6 +71,14 @@ class Group(ABC):
         :param batch: leading dimensions
         :return: (\\*batch, \\*element_shape)
         """
+
+    @property
+    def for_actions(self) -> "Group":
+        """
+        The same group with the parameters that actions are predicted in: small numbers are small moves there. States have
+        to cover the whole group, which "gram-schmidt" does without a seam; an action only has to leave the identity.
+        """
+        return self
 
 
 class MatrixGroup(Group):
@@ -149,7 +158,36 @@ def _planes(n: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
-ROTATIONS: dict[str, Callable[[th.Tensor, int], th.Tensor]] = {"euler": euler_rotation, "exp": exp_rotation}
+def gram_schmidt_rotation(params: th.Tensor, n: int) -> th.Tensor:
+    """
+    The n − 1 first columns are predicted whole and made orthonormal one after another, the last one completes a rotation
+    (Zhou et al. 2019, §4, https://arxiv.org/abs/1812.07035). Unlike angles, these numbers need not jump where a state comes
+    round to where it was: a continuous map from a loop to the real line cannot wind around a circle.
+
+    :param params: the columns one by one, (..., n(n-1)); all 0 is the identity
+    :return: (..., n, n)
+    """
+    eye = th.eye(n, dtype=params.dtype, device=params.device)
+    # A trace of the identity, so that a vector of zeros has a direction; lost in the rounding of any other.
+    raw = params.unflatten(-1, (n - 1, n)) + th.finfo(params.dtype).tiny ** 0.25 * eye[: n - 1]  # (..., n - 1, n)
+    columns: list[th.Tensor] = []
+    for column in raw.unbind(-2):
+        for found in columns:
+            column = column - (column * found).sum(-1, keepdim=True) * found
+        columns.append(F.normalize(column, dim=-1, eps=th.finfo(params.dtype).tiny))
+    known = th.stack(columns, dim=-1) if columns else params.new_empty(*params.shape[:-1], n, 0)  # (..., n, n - 1)
+    rows = th.tensor([[k for k in range(n) if k != i] for i in range(n)], dtype=th.long, device=params.device)  # (n, n - 1)
+    signs = th.tensor([(-1.0) ** (i + n - 1) for i in range(n)], dtype=params.dtype, device=params.device)
+    last = signs * th.linalg.det(known[..., rows, :])  # (..., n): the cofactors of the last column
+    return th.cat([known, last[..., None]], dim=-1)
+
+
+# name -> (how many numbers make a rotation of n-space, the rotation that they make)
+ROTATIONS: dict[str, tuple[Callable[[int], int], Callable[[th.Tensor, int], th.Tensor]]] = {
+    "euler": (lambda n: n * (n - 1) // 2, euler_rotation),
+    "exp": (lambda n: n * (n - 1) // 2, exp_rotation),
+    "gram-schmidt": (lambda n: n * (n - 1), gram_schmidt_rotation),
+}
 
 
 class GL(MatrixGroup):
@@ -166,8 +204,9 @@ class SO(MatrixGroup):
     """Special orthogonal: rotations of n-space, n ≥ 2."""
 
     def __init__(self, n: int, parameterization: str = "euler"):
-        super().__init__(f"SO({n})", n * (n - 1) // 2, (n, n))
-        self.rotation = ROTATIONS[parameterization]
+        count, self.rotation = ROTATIONS[parameterization]
+        super().__init__(f"SO({n})", count(n), (n, n))
+        self.parameterization = parameterization
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return self.rotation(params, self.element_shape[-1])
@@ -175,14 +214,19 @@ class SO(MatrixGroup):
     def inverse(self, element: th.Tensor) -> th.Tensor:
         return element.mT
 
+    @property
+    def for_actions(self) -> Group:
+        return SO(self.element_shape[-1]) if self.parameterization == "gram-schmidt" else self
+
 
 class SE(MatrixGroup):
-    """Special Euclidean: [[R, t], [0, 1]]. The angles of R come first among the parameters, then t."""
+    """Special Euclidean: [[R, t], [0, 1]]. What makes R comes first among the parameters, then t."""
 
     def __init__(self, n: int, parameterization: str = "euler"):
-        super().__init__(f"SE({n})", n * (n - 1) // 2 + n, (n + 1, n + 1))
+        count, self.rotation = ROTATIONS[parameterization]
+        super().__init__(f"SE({n})", count(n) + n, (n + 1, n + 1))
         self.n = n
-        self.rotation = ROTATIONS[parameterization]
+        self.parameterization = parameterization
 
     def element(self, params: th.Tensor) -> th.Tensor:
         angles, translation = params.split([self.num_params - self.n, self.n], dim=-1)
@@ -191,6 +235,10 @@ class SE(MatrixGroup):
     def inverse(self, element: th.Tensor) -> th.Tensor:
         rotation_inverse = element[..., :-1, :-1].mT
         return self._assemble(rotation_inverse, -rotation_inverse @ element[..., :-1, -1:])
+
+    @property
+    def for_actions(self) -> Group:
+        return SE(self.n) if self.parameterization == "gram-schmidt" else self
 
     def _assemble(self, rotation: th.Tensor, translation: th.Tensor) -> th.Tensor:
         top = th.cat([rotation, translation], dim=-1)  # (..., n, n + 1)
@@ -304,6 +352,10 @@ class ProductGroup(Group):
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         return self._flatten(group.identity(*batch, n, dtype=dtype, device=device) for group, n in self.factors)
 
+    @property
+    def for_actions(self) -> Group:
+        return ProductGroup([(group.for_actions, count) for group, count in self.factors])
+
     def _unflatten(self, element: th.Tensor) -> list[th.Tensor]:
         pieces = element.split(self._sizes, dim=-1)
         return [
@@ -328,7 +380,7 @@ def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
     :param group: "GL(n)", "SE(n)", "SO(n)", "T(n)", "none", a product such as "SE(2)^8 x SO(3)^4";
         a :class:`Group` is returned as it is
     :param parameterization: of rotations, in SO and SE: "euler" (product over planes, the default of the paper's
-        experiments) or "exp" (matrix exponential)
+        experiments), "exp" (matrix exponential) or "gram-schmidt" (orthonormalised columns, which have no seam)
     :raises ValueError: for a name or size that is not legal; the message lists the legal ones
     """
     if isinstance(group, Group):

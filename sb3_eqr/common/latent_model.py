@@ -13,13 +13,15 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group
-from sb3_eqr.common.losses import normalized_distance, reward_cross_entropy, reward_mse
+from sb3_eqr.common.losses import contrastive_loss, normalized_distance, reward_cross_entropy, reward_mse
 from sb3_eqr.common.type_aliases import LatentLosses
 
 Projection = Callable[[th.Tensor], th.Tensor]
 
 # name -> (outputs of the reward network, loss)
 REWARD_LOSSES = {"mse": (1, reward_mse), "categorical": (3, reward_cross_entropy)}
+# name -> loss of (B, M, P) predictions and targets, (B, M)
+AET_LOSSES = {"distance": normalized_distance, "contrastive": contrastive_loss}
 
 
 class LatentModel(nn.Module):
@@ -31,7 +33,9 @@ class LatentModel(nn.Module):
     :param n_actions: A
     :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
     :param reward_loss: "mse" (Eq. 17) or "categorical" (three signs, as in the authors' released code)
-    :raises ValueError: for an unknown reward loss
+    :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
+    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2
+    :raises ValueError: for an unknown loss
     """
 
     def __init__(
@@ -41,16 +45,23 @@ class LatentModel(nn.Module):
         n_actions: int,
         hidden_dim: int = 256,
         reward_loss: str = "mse",
+        aet_loss: str = "distance",
+        state_dependent_actions: bool = True,
     ):
         super().__init__()
-        if reward_loss not in REWARD_LOSSES:
-            raise ValueError(f"reward_loss: expected one of {list(REWARD_LOSSES)}, found {reward_loss!r}")
+        for name, found, legal in (("reward_loss", reward_loss, REWARD_LOSSES), ("aet_loss", aet_loss, AET_LOSSES)):
+            if found not in legal:
+                raise ValueError(f"{name}: expected one of {list(legal)}, found {found!r}")
+        group = group.for_actions
         self.group = group
         self.n_blocks = n_blocks
         self.n_actions = n_actions
         state_dim = n_blocks * prod(group.element_shape)
         algebra_dim = n_blocks * group.num_params
-        self.transition = _hidden_layer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
+        self.state_dependent_actions = state_dependent_actions
+        n_inputs = state_dim * state_dependent_actions + n_actions
+        self.transition = _hidden_layer(n_inputs, hidden_dim, algebra_dim)  # κ
+        self._aet_loss = AET_LOSSES[aet_loss]
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
         self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)  # r_ψ
         self.action_symmetry = _hidden_layer(state_dim, hidden_dim, algebra_dim)  # ρ
@@ -89,7 +100,7 @@ class LatentModel(nn.Module):
         if project is not None:
             with th.no_grad():
                 target_projected = target_project(target_states[:, 1:])  # (B, M, P)
-            aet = (normalized_distance(project(predicted), target_projected) * mask).sum(dim=1)
+            aet = (self._aet_loss(project(predicted), target_projected) * mask).sum(dim=1)
         if target is not None:
             get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
         if rewards is not None:
@@ -115,13 +126,14 @@ class LatentModel(nn.Module):
 
     def action_element(self, state: th.Tensor, one_hot: th.Tensor) -> th.Tensor:
         """
-        κ(x, a).
+        κ(x, a), or κ(a).
 
         :param state: (B, D)
         :param one_hot: (B, A)
         :return: K group elements, (B, K, *element_shape)
         """
-        return self._element(self.transition(th.cat([state, one_hot], dim=1)))
+        inputs = th.cat([state, one_hot], dim=1) if self.state_dependent_actions else one_hot
+        return self._element(self.transition(inputs))
 
     def act(self, elements: th.Tensor, state: th.Tensor) -> th.Tensor:
         """

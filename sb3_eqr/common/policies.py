@@ -24,6 +24,7 @@ Module = TypeVar("Module", bound=nn.Module)
 Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
+PROJECTIONS = ("head", "own", "none")
 
 
 class EqRPolicy(BasePolicy):
@@ -53,15 +54,20 @@ class EqRPolicy(BasePolicy):
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
-    :param parameterization: of rotations, "euler" or "exp"
+    :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
+    :param standardize: whether the encoder's algebra parameters are brought to mean 0 and variance 1 over the batch: states
+        cannot collapse to a point then
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
-    :param shared_projection: whether the AET loss projects with the first layer of the Q head; else with a layer of its own
+    :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a layer of its own, or
+        "none", the state itself (§5)
+    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, whatever the state
     :param act_with_target: choose actions by the target network, which is steadier with ``tau`` < 1 (as SR-SPR,
         https://openreview.net/forum?id=OpC-9aBBVJe, and BBF do); else by the online network
     :param reward_loss: set by the algorithm, see there
+    :param aet_loss: set by the algorithm, see there
     :param stock_kwargs: what else the stock policy takes
     :raises ValueError: for an argument out of its range
     """
@@ -89,13 +95,16 @@ class EqRPolicy(BasePolicy):
         group: str | Group | None = DEFAULT_GROUP,
         n_blocks: int | None = None,
         parameterization: str = "euler",
+        standardize: bool = False,
         dueling: bool = True,
         noisy: bool = True,
         sigma_init: float = 0.5,
         latent_hidden_dim: int = 256,
-        shared_projection: bool = True,
+        projection: str = "head",
+        state_dependent_actions: bool = True,
         act_with_target: bool = False,
         reward_loss: str = "mse",
+        aet_loss: str = "distance",
         **stock_kwargs: Any,
     ):
         legal = inspect.signature(super().__init__).parameters
@@ -108,16 +117,21 @@ class EqRPolicy(BasePolicy):
             )
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         check_number("sigma_init", sigma_init, 0)
+        if projection not in PROJECTIONS:
+            raise ValueError(f"projection: expected one of {list(PROJECTIONS)}, found {projection!r}")
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
+        self.standardize = standardize
         self.latent_hidden_dim = latent_hidden_dim
         self.dueling = dueling
         self.noisy = noisy
         self.sigma_init = sigma_init
-        self.shared_projection = shared_projection
+        self.projection = projection
+        self.state_dependent_actions = state_dependent_actions
         self.act_with_target = act_with_target
         self.reward_loss = reward_loss
+        self.aet_loss = aet_loss
         super().__init__(  # builds
             observation_space,
             action_space,
@@ -153,6 +167,7 @@ class EqRPolicy(BasePolicy):
             "group": self.group,
             "n_blocks": self.n_blocks,
             "parameterization": self.parameterization,
+            "standardize": self.standardize,
             "normalized_image": not self.normalize_images,
         }
         if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
@@ -186,12 +201,18 @@ class EqRPolicy(BasePolicy):
         else:
             group, n_blocks = NoGroup(encoder.features_dim), 1
         self.latent_model = LatentModel(
-            group, n_blocks, int(self.action_space.n), self.latent_hidden_dim, self.reward_loss
+            group,
+            n_blocks,
+            int(self.action_space.n),
+            self.latent_hidden_dim,
+            self.reward_loss,
+            self.aet_loss,
+            self.state_dependent_actions,
         ).to(self.device)
         self.latent_model_target = _frozen_copy(self.latent_model)
         parameters = list(self.latent_model.parameters())
         self.own_projection = self.own_projection_target = None
-        if not self.shared_projection:
+        if self.projection == "own":
             self.own_projection = nn.Linear(encoder.features_dim, self.latent_hidden_dim).to(self.device)
             self.own_projection_target = _frozen_copy(self.own_projection)
             parameters += self.own_projection.parameters()
@@ -204,13 +225,18 @@ class EqRPolicy(BasePolicy):
 
     @property
     def project(self) -> Projection:
-        """p of the AET loss: the first layer of the Q head, or a layer of its own."""
-        return self.online.head.project if self.own_projection is None else self.own_projection
+        """p of the AET loss."""
+        return self._projections(self.online, self.own_projection)
 
     @property
     def target_project(self) -> Projection:
         """p̄, from the target copy."""
-        return self.target.head.project if self.own_projection_target is None else self.own_projection_target
+        return self._projections(self.target, self.own_projection_target)
+
+    def _projections(self, network: EqRNetwork, own: nn.Linear | None) -> Projection:
+        if own is not None:
+            return own
+        return network.head.project if self.projection == "head" else nn.Identity()
 
     def update_target(self, tau: float) -> None:
         """
@@ -273,13 +299,16 @@ class EqRPolicy(BasePolicy):
             group=self.group,
             n_blocks=self.n_blocks,
             parameterization=self.parameterization,
+            standardize=self.standardize,
             latent_hidden_dim=self.latent_hidden_dim,
             dueling=self.dueling,
             noisy=self.noisy,
             sigma_init=self.sigma_init,
-            shared_projection=self.shared_projection,
+            projection=self.projection,
+            state_dependent_actions=self.state_dependent_actions,
             act_with_target=self.act_with_target,
             reward_loss=self.reward_loss,
+            aet_loss=self.aet_loss,
         )
         return data
 

@@ -1,17 +1,41 @@
 """Environments. Importing this needs no extra; making an Atari environment needs ``pip install sb3-eqr[atari]``."""
 
+from typing import Any
+
 import gymnasium as gym
 
 from sb3_eqr.envs.atari import make_atari100k_env
 from sb3_eqr.envs.blind_cliffwalk import BlindCliffwalk
 from sb3_eqr.envs.minatar import register_minatar
+from sb3_eqr.envs.pixel_pendulum import PixelPendulum
+from sb3_eqr.envs.sliding_ball import SlidingBall
+from sb3_eqr.envs.star_field import StarField
+
+# Keyword arguments for gymnasium.register.
+WORLDS: dict[str, dict[str, Any]] = {
+    "BlindCliffwalk-v0": {"entry_point": "sb3_eqr.envs.blind_cliffwalk:BlindCliffwalk"},
+    "SlidingBall-v0": {"entry_point": "sb3_eqr.envs.sliding_ball:SlidingBall", "max_episode_steps": 100},
+    "SlidingBallTorus-v0": {
+        "entry_point": "sb3_eqr.envs.sliding_ball:SlidingBall",
+        "max_episode_steps": 100,
+        "kwargs": {"dimensions": 2},
+    },
+    "PixelPendulum-v0": {"entry_point": "sb3_eqr.envs.pixel_pendulum:PixelPendulum", "max_episode_steps": 200},
+    "StarField-v0": {"entry_point": "sb3_eqr.envs.star_field:StarField", "max_episode_steps": 100},
+    "StarFieldRotations-v0": {
+        "entry_point": "sb3_eqr.envs.star_field:StarField",
+        "max_episode_steps": 100,
+        "kwargs": {"translations": False},
+    },
+}
 
 
 def register() -> None:
-    """Register with gymnasium: BlindCliffwalk-v0, and MinAtar's games (making one needs ``pip install minatar``)."""
-    if "BlindCliffwalk-v0" not in gym.registry:
-        gym.register("BlindCliffwalk-v0", entry_point="sb3_eqr.envs.blind_cliffwalk:BlindCliffwalk")
+    """Register with gymnasium: the worlds above, and MinAtar's games (making one needs ``pip install minatar``)."""
+    for env_id, arguments in WORLDS.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, **arguments)
     register_minatar()
 
 
-__all__ = ["BlindCliffwalk", "make_atari100k_env", "register"]
+__all__ = ["BlindCliffwalk", "PixelPendulum", "SlidingBall", "StarField", "make_atari100k_env", "register"]

@@ -1,0 +1,203 @@
+"""
+Example 2 and Figure 3 of the paper: the latent space of a sliding ball, learned from random play without reward.
+
+    python examples/sliding_ball.py                                  # the ball, SO(2), one seed: two minutes
+    python examples/sliding_ball.py --seeds 0 1 2 3 4 --arms all     # the table of docs/representation.md
+    python examples/sliding_ball.py --world torus                    # a torus, two blocks
+
+Leaves a model and a picture per run and results.jsonl (a line per run; what is in there is not run again) in --out.
+"""
+
+import argparse
+import json
+import pathlib
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch as th
+from torch.nn.functional import one_hot
+
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.envs import SlidingBall
+from sb3_eqr.representation import train_representation
+from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+DEFAULT_ARM = "standardised, seamless"
+PAPER: dict[str, Any] = {"parameterization": "euler", "standardize": False}  # the example as the paper states it
+ARMS: dict[str, dict[str, Any]] = {
+    DEFAULT_ARM: {},
+    "AET alone": PAPER,
+    "AET alone, seamless": {"standardize": False},
+    "AET alone, standardised": {"parameterization": "euler"},
+    "contrastive": {**PAPER, "aet_loss": "contrastive"},
+    "contrastive, seamless": {"standardize": False, "aet_loss": "contrastive"},
+    "contrastive, standardised, seamless": {"aet_loss": "contrastive"},
+    "actions depend on the state": {"state_dependent_actions": True},
+}
+DIMENSIONS = {"ball": 1, "torus": 2}
+STEPS = {"ball": 2_000, "torus": 5_000}
+GRID = {"ball": 192, "torus": 48}  # positions per axis that the learned map is looked at
+STEPS_AHEAD = 20
+WIDTH = 0.25  # of the ball, in loops
+
+
+def pictures(world: SlidingBall, positions: np.ndarray) -> th.Tensor:
+    """
+    :param positions: (N, axes)
+    :return: (N, 1, size, size), uint8
+    """
+    return th.as_tensor(np.stack([np.moveaxis(world.draw(position), -1, 0) for position in positions]))
+
+
+def turns(model: EqRQRDQN, elements: th.Tensor) -> np.ndarray:
+    """
+    :param elements: states, (N, D), or actions' elements, (N, A, K, 2, 2)
+    :return: the angles of the K blocks, in turns, (N, K) or (N, A, K)
+    """
+    blocks = split(model, elements)[0]
+    return coordinates(blocks.group, blocks.elements)[..., 0].double().numpy() / (2 * np.pi)
+
+
+def grid(axes: int, per_axis: int) -> np.ndarray:
+    """
+    :return: positions, (per_axis ** axes, axes)
+    """
+    return np.stack(np.meshgrid(*[np.arange(per_axis) / per_axis] * axes, indexing="ij"), axis=-1).reshape(-1, axes)
+
+
+def linearity(angle: np.ndarray, positions: np.ndarray) -> tuple[list[int], float]:
+    """
+    How well a block's angle is a whole number of turns per loop of each axis, plus a constant: circular R² is
+    1 - the mean square of what is left over that of a uniform angle, 1/12 of a turn squared.
+
+    :param angle: in turns, (N,)
+    :param positions: in loops, (N, axes)
+    :return: the best numbers of turns, at most 3 each way, and their R²
+    """
+    best, best_score = [0] * positions.shape[1], -np.inf
+    for counts in np.stack(np.meshgrid(*[np.arange(-3, 4)] * positions.shape[1]), axis=-1).reshape(-1, positions.shape[1]):
+        left = np.exp(2j * np.pi * (angle - positions @ counts))
+        score = 1 - 12 * np.square(np.angle(left / left.mean()) / (2 * np.pi)).mean() if counts.any() else -np.inf
+        if score > best_score:
+            best, best_score = counts.tolist(), float(score)
+    return best, best_score
+
+
+def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n: int = 200) -> np.ndarray:
+    """
+    From random places by random actions, ``STEPS_AHEAD`` steps in the latent space; then the place whose latent state is
+    the nearest.
+
+    :param places: to choose from, (N, axes)
+    :return: its distance from where the ball is then, in widths of the ball, (n,)
+    """
+    rng = np.random.default_rng(0)
+    actions = rng.integers(0, 2 * world.dimensions, (n, STEPS_AHEAD))
+    starts = rng.random((n, world.dimensions))
+    axis, forwards = np.divmod(actions, 2)
+    moved = ((2 * forwards - 1)[..., None] * np.eye(world.dimensions)[axis]).sum(axis=1)  # (n, axes), in steps
+    latent_model = model.policy.latent_model
+    with th.no_grad():
+        states = encode(model, pictures(world, starts))
+        steps = one_hot(th.as_tensor(actions), latent_model.n_actions).float()
+        predicted = latent_model.rollout(states, steps, th.ones(actions.shape))[:, -1]  # (n, D)
+    nearest = th.cdist(predicted, encode(model, pictures(world, places))).argmin(dim=1).numpy()
+    apart = (places[nearest] - starts - moved / world.n_steps + 0.5) % 1 - 0.5
+    return np.linalg.norm(apart, axis=1) / WIDTH
+
+
+def measure(model: EqRQRDQN, world: SlidingBall, per_axis: int) -> dict[str, Any]:
+    """What was learned, in numbers. Angles of actions are in steps of the ball."""
+    places = grid(world.dimensions, per_axis)
+    states = encode(model, pictures(world, places))
+    angles = turns(model, states)  # (N, K)
+    fits = [linearity(angles[:, k], places) for k in range(angles.shape[1])]
+    elements = action_elements(model, states[:: max(len(states) // 64, 1)])
+    moves = np.angle(np.exp(2j * np.pi * turns(model, elements)).mean(axis=0)) / (2 * np.pi) * world.n_steps  # (A, K)
+    wrapped = np.diff(angles[:, 0], append=angles[:1, 0])
+    errors = prediction_errors(model, world, places)
+    return {
+        "turns_per_loop": [counts for counts, _ in fits],
+        "circular_r2": [round(score, 5) for _, score in fits],
+        "winding": float(np.round(np.sum((wrapped + 0.5) % 1 - 0.5), 2)) if world.dimensions == 1 else None,
+        "action_steps": np.round(moves, 4).tolist(),
+        "not_opposite": round(float(np.abs(moves[0::2] + moves[1::2]).max()), 4),
+        "ahead_mean": round(float(errors.mean()), 4),
+        "ahead_max": round(float(errors.max()), 4),
+    }
+
+
+def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) -> None:
+    """Figure 3: each block moves the vector (1, 0); the eight red points are eight equal steps along an axis."""
+    n_blocks, axes = model.policy.latent_model.n_blocks, world.dimensions
+    figure, panels = plt.subplots(
+        axes, n_blocks + 1, figsize=(3 * (n_blocks + 1), 3.2 * axes), squeeze=False, layout="constrained"
+    )
+    figure.suptitle(title, fontsize="medium")
+    for axis in range(axes):
+        along = np.full((GRID["ball"], axes), 0.5)
+        along[:, axis] = np.arange(GRID["ball"]) / GRID["ball"]
+        every = along[:: GRID["ball"] // 8]  # eight positions
+        angles = 2 * np.pi * turns(model, encode(model, pictures(world, along)))
+        eight = 2 * np.pi * turns(model, encode(model, pictures(world, every)))
+        panels[axis, 0].imshow(pictures(world, every).amax(dim=0)[0], cmap="gray")
+        panels[axis, 0].set_title("eight positions", fontsize="small")
+        panels[axis, 0].set_axis_off()
+        for k in range(n_blocks):
+            panel = panels[axis, k + 1]
+            panel.plot(np.cos(angles[:, k]), -np.sin(angles[:, k]), ".", color="0.7", markersize=3)
+            panel.plot(np.cos(eight[:, k]), -np.sin(eight[:, k]), "o", color="C3", markersize=6)
+            for number, angle in enumerate(eight[:, k]):
+                panel.annotate(
+                    str(number), (1.18 * np.cos(angle), -1.18 * np.sin(angle)), ha="center", va="center", fontsize=7
+                )
+            panel.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
+            panel.set_title(f"block {k}" + (f", moving along axis {axis}" if axes > 1 else ""), fontsize="small")
+    with atomic_write(path, "png") as file:
+        figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[str, Any]:
+    """Train, save, measure, draw."""
+    world = SlidingBall(dimensions=DIMENSIONS[world_name])
+    model = train_representation(world, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, **ARMS[arm])
+    name = f"{world_name}-{arm}-{seed}".replace(", ", "-").replace(" ", "_")
+    model.save(out / name)
+    result = {"world": world_name, "arm": arm, "seed": seed, "steps": steps, **measure(model, world, GRID[world_name])}
+    draw(model, world, f"{world_name}, {arm}, seed {seed}", out / f"{name}.png")
+    return result
+
+
+def main() -> None:
+    """Run what is not in results.jsonl yet."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--world", choices=DIMENSIONS, default="ball", help="a loop or a torus")
+    parser.add_argument("--arms", nargs="+", default=[DEFAULT_ARM], choices=[*ARMS, "all"], help="what is trained")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of everything random")
+    parser.add_argument("--steps", type=int, help="of random play; without it, 2000 for the ball, 5000 for the torus")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="folder")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    results = args.out / "results.jsonl"
+    steps = args.steps or STEPS[args.world]
+    lines = results.read_text().splitlines() if results.exists() else []
+    done = {tuple(json.loads(line)[key] for key in ("world", "arm", "seed", "steps")) for line in lines}
+    for arm in ARMS if "all" in args.arms else args.arms:
+        for seed in args.seeds:
+            if (args.world, arm, seed, steps) not in done:
+                line = json.dumps(run(args.world, arm, seed, steps, args.out))
+                print(line, flush=True)
+                with results.open("a") as file:
+                    file.write(line + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""The pendulum of the paper (Example 1), seen: a world with the symmetries of O(2) once gravity is off."""
+
+from math import cos, pi, remainder, sin
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, enlarge
+
+# The constants of gymnasium's Pendulum-v1; mass and length are 1.
+GRAVITY = 10.0  # m/s²
+TIME_STEP = 0.05  # s
+MAX_SPEED = 8.0  # rad/s
+MAX_TORQUE = 2.0  # N m
+FREE_MAX_TORQUE = 5.0  # N m; one step of it moves the tip of the rod by 0.7 of 48 pixels, where 2 would move it by 0.3
+
+
+class PixelPendulum(gym.Env):
+    """
+    A rod that turns about the centre of the picture (EqR, §5, Example 1 and Figure 2), with the dynamics of
+    gymnasium's Pendulum-v1 and discrete torques.
+
+    The angle is in radians, 0 upright, positive anticlockwise, in [−π, π]; the angular velocity in rad/s, in [−8, 8].
+    A step of 0.05 s is semi-implicit: ω' = ω + (15 sin θ + 3 u) 0.05, clipped, then θ' = θ + 0.05 ω'. Without gravity the
+    sine goes: then turning the world leaves an action's effect alone and mirroring it, (θ, ω, u) → (−θ, −ω, −u), negates
+    the torque. With gravity the mirror about the vertical is all that is left.
+
+    The observation is (size, size, 2), uint8: the previous and the present picture, so that the velocity can be seen.
+    ``info`` holds the true "angle" and "velocity". No episode ends.
+
+    :param gravity: whether there is any. With it, torques up to 2 N m, too weak to lift the rod at once, and the reward
+        of Pendulum-v1, −(θ² + 0.1 ω² + 0.001 u²) of the state before the step, in [−16.3, 0]. Without it, torques up to
+        5 N m, and the reward is 0: any preferred state would break the symmetry.
+    :param size: of the picture, in pixels; at least 36
+    :param n_torques: how many actions there are, evenly spaced from the most negative torque (action 0, clockwise) to its
+        mirror; odd, at least 3: the middle one is no torque
+    :param render_mode: "rgb_array": the present picture, enlarged
+    :raises ValueError: for an argument outside these ranges
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, gravity: bool = True, size: int = 48, n_torques: int = 3, render_mode: str | None = None):
+        check_number("size", size, SMALLEST_PICTURE, whole=True)
+        check_number("n_torques", n_torques, 3, whole=True)
+        if n_torques % 2 == 0:
+            raise ValueError(f"n_torques: expected an odd number, so that the middle one is 0, found {n_torques}")
+        self.gravity = gravity
+        self.size = size
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(0, 255, (size, size, 2), np.uint8)
+        self.action_space = spaces.Discrete(n_torques)
+        middle = n_torques // 2
+        # Not linspace: the two halves are each other's negative to the last bit.
+        self.torques = (MAX_TORQUE if gravity else FREE_MAX_TORQUE) * (np.arange(n_torques) - middle) / middle
+        self.angle = 0.0
+        self.velocity = 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param options: {"angle": any, in radians; "velocity": in [−8, 8] rad/s}. What is not given is drawn uniformly as
+            in Pendulum-v1: from [−π, π] and [−1, 1].
+        :return: observation, (size, size, 2); {"angle": radians, "velocity": rad/s}
+        :raises ValueError: for other options
+        """
+        super().reset(seed=seed)
+        options = check_options(options, ["angle", "velocity"])
+        # Both are drawn in any case: an option leaves the other draw as it was.
+        drawn = {"angle": self.np_random.uniform(-pi, pi), "velocity": self.np_random.uniform(-1, 1)}
+        state = {**drawn, **options}
+        check_number("angle", state["angle"], -np.inf)
+        check_number("velocity", state["velocity"], -MAX_SPEED, MAX_SPEED)
+        self.angle = remainder(state["angle"], 2 * pi)
+        self.velocity = float(state["velocity"])
+        return self.draw(self.angle, self.velocity), self._info()
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: which torque, 0 … ``n_torques`` − 1
+        :return: observation, (size, size, 2); reward; no end; no time-outs; {"angle": radians, "velocity": rad/s}
+        :raises ValueError: for another action
+        """
+        check_action(self.action_space, action)
+        torque = float(self.torques[action])
+        cost = self.angle**2 + 0.1 * self.velocity**2 + 0.001 * torque**2
+        weight = 1.5 * GRAVITY * sin(self.angle) if self.gravity else 0.0
+        velocity = self.velocity + (weight + 3 * torque) * TIME_STEP
+        self.velocity = min(max(velocity, -MAX_SPEED), MAX_SPEED)
+        # remainder, unlike %, is exact and odd: mirrored states stay each other's mirror.
+        self.angle = remainder(self.angle + self.velocity * TIME_STEP, 2 * pi)
+        return self.draw(self.angle, self.velocity), -cost if self.gravity else 0.0, False, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {"angle": self.angle, "velocity": self.velocity}
+
+    def draw(self, angle: float, velocity: float) -> np.ndarray:
+        """
+        :param angle: in radians, any
+        :param velocity: in rad/s; the previous angle is ``angle`` − 0.05 ``velocity``, exactly so after a step
+        :return: what the agent sees there, (size, size, 2), uint8
+        """
+        return np.stack([self._picture(angle - velocity * TIME_STEP), self._picture(angle)], axis=2)
+
+    def _picture(self, angle: float) -> np.ndarray:
+        """The rod at an angle: (size, size), uint8."""
+        along = np.array([-cos(angle), -sin(angle)])  # rows count downwards, so upright is −1
+        centred = np.arange(self.size) + 0.5 - self.size / 2
+        rows, columns = centred[:, None], centred[None, :]
+        # The nearest point of the rod, then the distance to it, in pixels.
+        nearest = np.clip(rows * along[0] + columns * along[1], 0, 0.4 * self.size)
+        distance = np.hypot(rows - nearest * along[0], columns - nearest * along[1])
+        return np.rint(255 * np.clip(self.size / 24 + 0.5 - distance, 0, 1)).astype(np.uint8)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        :return: with ``render_mode="rgb_array"`` (4 size, 4 size, 3), uint8
+        """
+        if self.render_mode is None:
+            return None
+        return enlarge(self._picture(self.angle)[:, :, None].repeat(3, axis=2))

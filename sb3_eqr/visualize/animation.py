@@ -1,0 +1,250 @@
+"""An agent at play, and beside it the blocks of its latent state as moving frames: now, and as predicted before."""
+
+import pathlib
+import random
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import torch as th
+from PIL import Image
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.groups import NoGroup
+from sb3_eqr.common.safe_files import atomic_write, get_rng_state, set_rng_state
+from sb3_eqr.common.type_aliases import PyTorchObs
+from sb3_eqr.visualize.canvas import Line, Painter
+from sb3_eqr.visualize.latents import action_elements, encode
+from sb3_eqr.visualize.pixels import observed_pictures
+from sb3_eqr.visualize.sketches import panels
+
+MAX_PANELS = 36
+FPS = 15  # Atari's 60 frames a second, of which an agent sees every fourth
+FORMATS = ("mp4", "gif")
+GIF_COLOURS = 64
+GIF_INTERVAL = 2  # every so many frames one is in the GIF
+
+
+class Film(NamedTuple):
+    """T steps of one environment."""
+
+    observations: PyTorchObs  # (T, *obs_shape): s_t, as the network gets them
+    pictures: Sequence[np.ndarray]  # T of (height, width, 3), uint8
+    actions: np.ndarray  # (T,), int64: a_t
+    rewards: np.ndarray  # (T,): r_{t+1}, before normalisation
+    starts: np.ndarray  # (T,), int64: the step at which the episode of each began
+    action_names: list[str]  # one per action
+
+
+def record(
+    model: EqRAlgorithm,
+    env: GymEnv,
+    path: str | pathlib.Path,
+    n_steps: int = 200,
+    depth: int = 5,
+    seed: int = 0,
+    formats: Sequence[str] = FORMATS,
+    fps: float | None = None,
+    deterministic: bool = True,
+) -> list[pathlib.Path]:
+    """
+    A video of the agent playing: left the game, right one panel per block of its latent state. What turns is an arrow, what
+    shifts a dot with a trail; of a general matrix, the images of the unit vectors; in three dimensions, the three axes
+    (red, green, blue); without a group, the first two principal components. In orange, or pale, what the latent model
+    predicted for this moment ``depth`` steps before, from the state of then and the actions since. Above, the action that
+    the agent chooses in this picture, its reward, and the score with it.
+
+    All random generators are left as they were; the same seed draws the same frames.
+
+    :param model: any EqR agent; its latent model predicts only where it was trained (``prediction_depth`` > 0)
+    :param env: not the one in training, preprocessed as in training; a VecNormalize with ``training=False``. Of several
+        environments the first is filmed. With ``render_mode="rgb_array"`` its rendering is shown, else what the agent sees
+    :param path: without suffix; every format adds its own. Folders are made, files written beside and renamed
+    :param n_steps: of the environment, one frame each; more than ``depth``
+    :param depth: M ≥ 1
+    :param seed: of the environment and of the agent's noise
+    :param formats: "mp4" (H.264) and "gif" (every second frame)
+    :param fps: frames per second; 15 where not given, which is Atari's own speed
+    :param deterministic: whether the agent acts without noise
+    :return: the files, in the order of ``formats``
+    :raises ValueError: for an argument out of its range, or an environment that is not the agent's
+    :raises ImportError: without the extra "visualize"
+    """
+    if not isinstance(model, EqRAlgorithm):
+        raise ValueError(f"model: expected an EqR agent, found {type(model).__name__}. Load it by the class that saved it.")
+    check_number("depth", depth, 1, whole=True)
+    check_number("n_steps", n_steps, depth + 1, whole=True)
+    fps = FPS if fps is None else fps
+    check_number("fps", fps, 1, 50)  # what a GIF can do
+    if not formats or set(formats) - set(FORMATS):
+        raise ValueError(f"formats: expected some of {list(FORMATS)}, found {formats!r}")
+    with _generators_kept(model):
+        film = shoot(model, env, n_steps, seed, deterministic)
+    states = encode(model, film.observations)  # (T, D)
+    ghosts = predictions(model, states, film.actions, film.starts, depth)
+    latent_model = model.policy.latent_model
+    group, n_blocks = latent_model.group, latent_model.n_blocks
+    about = "no group" if isinstance(group, NoGroup) else f"{n_blocks} block{'s' if n_blocks > 1 else ''} of {group}"
+    shown = panels(model, states, ghosts, MAX_PANELS)
+    about += f", the first {MAX_PANELS} panels" if len(shown) == MAX_PANELS else ""
+    painter = Painter(shown, film.starts, depth, f"{type(model).__name__}, {about}")
+    return write_video(frames(film, painter), pathlib.Path(path), formats, fps)
+
+
+def shoot(model: EqRAlgorithm, env: GymEnv, n_steps: int, seed: int, deterministic: bool) -> Film:
+    """
+    Let the agent play. Seeds the global generators.
+
+    :param model: the agent
+    :param env: see :func:`record`
+    :param n_steps: T
+    :param seed: of the environment and of the agent's noise
+    :param deterministic: whether the agent acts without noise
+    """
+    env = model._wrap_env(env, monitor_wrapper=False)
+    for what in ("observation_space", "action_space"):
+        if getattr(env, what) != getattr(model, what):
+            raise ValueError(
+                f"env: expected the agent's {what} {getattr(model, what)}, found {getattr(env, what)}. "
+                "Wrap the environment as in training."
+            )
+    normalize = unwrap_vec_normalize(env)
+    renders = env.render_mode == "rgb_array"
+    random.seed(seed)
+    np.random.seed(seed)
+    th.manual_seed(seed)
+    model.action_space.seed(seed)  # of ε-greedy actions
+    env.seed(seed)
+    obs: Any = env.reset()
+    observations, pictures, actions, rewards, starts, start = [], [], [], [], [], 0
+    for t in range(n_steps):
+        observations.append(obs)
+        if renders:
+            pictures.append(np.asarray(env.get_images()[0], dtype=np.uint8))
+        chosen, _ = model.predict(obs, deterministic=deterministic)
+        obs, reward, dones, _ = env.step(chosen)
+        actions.append(int(chosen[0]))
+        rewards.append(float((reward if normalize is None else normalize.get_original_reward())[0]))
+        starts.append(start)
+        start = t + 1 if dones[0] else start
+    seen = _first_envs(observations)
+    if not renders:
+        pictures = observed_pictures(seen, model.observation_space, model.frame_stack)
+    tensors = {key: th.as_tensor(x) for key, x in seen.items()} if isinstance(seen, dict) else th.as_tensor(seen)
+    return Film(tensors, pictures, np.array(actions), np.array(rewards), np.array(starts), _action_names(model, env))
+
+
+def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
+    """
+    What the latent model predicted ``depth`` steps before.
+
+    :param model: the agent
+    :param states: x₀ of consecutive steps, (T, D)
+    :param actions: a_t, (T,)
+    :param starts: the step at which the episode of each began, (T,)
+    :param depth: M
+    :return: x̂_M for each step, (T, D); NaN where the episode was not that old
+    """
+    n = len(states) - depth
+    predicted, rows = states[:n], th.arange(n)
+    for m in range(depth):
+        moves = action_elements(model, predicted)[rows, th.as_tensor(actions[m : m + n])]
+        predicted = model.policy.latent_model.act(moves, predicted)
+    old_enough = th.as_tensor(np.arange(depth, len(states)) - starts[depth:] >= depth, device=states.device)
+    nothing = th.full_like(states, float("nan"))
+    return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])
+
+
+def frames(film: Film, painter: Painter) -> Iterator[np.ndarray]:
+    """
+    :param film: T steps
+    :param painter: of their latents
+    :return: T of (height, width, 3), uint8
+    """
+    score = 0.0
+    for t, (action, reward, start) in enumerate(zip(film.actions, film.rewards, film.starts, strict=True)):
+        score = reward + (0.0 if t == start else score)
+        yield painter.paint(t, film.pictures[t], Line(t - start, film.action_names[action], reward, score))
+
+
+def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Sequence[str], fps: float) -> list[pathlib.Path]:
+    """
+    :param images: (height, width, 3), uint8, of even size
+    :param path: without suffix
+    :param formats: of :data:`FORMATS`
+    :param fps: frames per second
+    :return: the files
+    """
+    if "mp4" in formats:
+        try:
+            import imageio.v2 as imageio
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise ImportError('MP4 needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
+    paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
+    with ExitStack() as stack:
+        files = {suffix: stack.enter_context(atomic_write(p, suffix)) for suffix, p in zip(formats, paths, strict=True)}
+        movie = None
+        if "mp4" in formats:
+            movie = imageio.get_writer(
+                files["mp4"].name,
+                format="FFMPEG",  # type: ignore[arg-type]
+                fps=fps,
+                codec="libx264",
+                pixelformat="yuv420p",
+                macro_block_size=2,
+                output_params=["-f", "mp4"],  # the name of the partial file does not tell
+            )
+            stack.callback(movie.close)
+        kept = []
+        for t, image in enumerate(images):
+            if movie is not None:
+                movie.append_data(image)
+            if "gif" in formats and t % GIF_INTERVAL == 0:
+                kept.append(Image.fromarray(image))
+        if kept:
+            _write_gif(kept, files["gif"], fps / GIF_INTERVAL)
+    return paths
+
+
+def _write_gif(images: list[Image.Image], file: BinaryIO, fps: float) -> None:
+    """With one palette for all, so that what stands still costs nothing."""
+    some = images[:: max(len(images) // 8, 1)]
+    strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    for i, image in enumerate(some):
+        strip.paste(image, (0, i * image.height))
+    palette = strip.quantize(GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE)  # rare colours count: arrows are thin
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0, optimize=False)
+
+
+def _first_envs(observations: list[Any]) -> Any:
+    """
+    :param observations: T of (n_envs, *obs_shape), or dicts of these
+    :return: (T, *obs_shape), of the first environment
+    """
+    if isinstance(observations[0], dict):
+        return {key: np.stack([obs[key][0] for obs in observations]) for key in observations[0]}
+    return np.stack([obs[0] for obs in observations])
+
+
+def _action_names(model: EqRAlgorithm, env: VecEnv) -> list[str]:
+    n_actions = int(model.policy.action_space.n)
+    if env.has_attr("get_action_meanings"):  # Atari's own
+        names = env.env_method("get_action_meanings", indices=[0])[0]
+        if len(names) == n_actions:
+            return [str(name) for name in names]
+    return [f"action {i}" for i in range(n_actions)]
+
+
+@contextmanager
+def _generators_kept(model: EqRAlgorithm) -> Iterator[None]:
+    state = get_rng_state(model.action_space)
+    try:
+        yield
+    finally:
+        set_rng_state(state, model.action_space)

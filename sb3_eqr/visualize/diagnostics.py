@@ -1,0 +1,123 @@
+"""What an agent's latent model has learned, in numbers."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from torch.nn import functional as F
+
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.visualize import measures
+from sb3_eqr.visualize.findings import (
+    ActionSymmetry,
+    Collapse,
+    Disentanglement,
+    Generators,
+    Motion,
+    find_action_symmetry,
+    find_collapse,
+    find_disentanglement,
+    find_generators,
+    find_motion,
+)
+from sb3_eqr.visualize.latents import Play, _eval_mode, action_elements, latents, split
+from sb3_eqr.visualize.measures import Rewards, Transition
+
+MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
+PREDICTS = 0.25  # the least skill, and the least gain
+COLLAPSED = 1e-3  # of squared distance on the unit sphere: directions within two degrees of each other
+
+
+class Diagnostics(NamedTuple):
+    """What :func:`diagnose` finds. M steps ahead, A actions, K blocks, F factors."""
+
+    blocks: list[str]  # (K,): "SE(2) 0", ...
+    transition: Transition  # in the latent space
+    loss: Transition  # the same between p(x̂_m) and p(x_m) on the unit sphere: the distance of Eq. 18, which is trained
+    motion: Motion
+    generators: list[Generators]  # one per group
+    disentanglement: Disentanglement
+    action_symmetry: ActionSymmetry | None  # None where the group has no inverse
+    collapse: Collapse
+    rewards: Rewards
+    verdict: str  # "predicts", "does not predict" or "collapsed"
+
+    @property
+    def summary(self) -> str:
+        """One line for humans."""
+        skill, gain = skill_and_gain(self.loss)
+        return (
+            f"{self.verdict}: {_share(skill)} of the way from knowing nothing to exact, {_share(gain)} from standing still, "
+            f"{len(self.loss.error)} steps ahead; effective rank {self.collapse.effective_rank:.1f} of "
+            f"{self.collapse.dimensions}; {self.collapse.dead_units:.0%} of the trunk's units dead."
+        )
+
+
+def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
+    """
+    Every number of this module. No global random generator is used.
+
+    :param model: any EqR agent
+    :param play: of :func:`~sb3_eqr.visualize.latents.play` or :func:`~sb3_eqr.visualize.latents.replayed`
+    :param seed: draws the pairs of ``action_symmetry``
+    """
+    data = latents(model, play.samples)
+    project = model.policy.project
+    with th.no_grad(), _eval_mode(model):
+        projected = [F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)]
+    chosen = th.linspace(0, len(data.states) - 1, min(len(data.states), MAX_STATES)).long().to(data.states.device)
+    elements = action_elements(model, data.states[chosen])  # (n, A, K, ...)
+    motion = find_motion(model, data, data.states[chosen], elements)
+    generators = find_generators(model, elements)
+    loss = measures.transition_error(*projected, data.mask)
+    signed = model.policy.latent_model.reward_net[-1].out_features == 3
+    return Diagnostics(
+        blocks=[
+            f"{group} {i}"
+            for group, found in split(model, data.states)
+            for i in range(found.shape[-1 - len(group.element_shape)])
+        ],
+        transition=measures.transition_error(data.states, data.next_states, data.predicted, data.mask),
+        loss=loss,
+        motion=motion,
+        generators=generators,
+        disentanglement=find_disentanglement(model, data.states, play.factors, motion, generators),
+        action_symmetry=find_action_symmetry(model, data, np.random.default_rng(seed)),
+        collapse=find_collapse(model, data.states, play.samples.observations),
+        rewards=measures.reward_error(data.predicted_rewards, data.rewards.sign() if signed else data.rewards, data.mask),
+        verdict=find_verdict(loss),
+    )
+
+
+def find_verdict(loss: Transition) -> str:
+    """
+    - "predicts": the rollout explains a quarter of what knowing nothing leaves open, and a quarter of what standing still does.
+      An untrained agent whose states differ may do the first, for its κ moves them little, but not the second.
+    - "collapsed": else, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are one, and κ
+      leaves it where it is. In an untrained agent the states may be nearly one, but κ moves them away from it.
+    - "does not predict": else.
+
+    :param loss: on the unit sphere
+    """
+    skill, gain = skill_and_gain(loss)
+    if skill >= PREDICTS and gain >= PREDICTS:
+        return "predicts"
+    return "collapsed" if _mean(loss.shuffled, loss.n_windows) < COLLAPSED else "does not predict"
+
+
+def skill_and_gain(errors: Transition) -> tuple[float, float]:
+    """
+    :return: of all steps ahead together, so that a step in which nothing moves has no weight; NaN where nothing ever does
+    """
+    error, shuffled, still = (_mean(x, errors.n_windows) for x in (errors.error, errors.shuffled, errors.still))
+    known = [~np.isnan(x).all() for x in (errors.skill, errors.gain)]
+    return (1 - error / shuffled if known[0] else np.nan), (1 - error / still if known[1] else np.nan)
+
+
+def _mean(values: np.ndarray, weights: np.ndarray) -> float:
+    known = weights > 0
+    return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan
+
+
+def _share(value: float) -> str:
+    return "?" if np.isnan(value) else f"{max(value, 0):.0%}"

@@ -1,0 +1,209 @@
+"""What each part of a diagnosis looks at: motion, generators, blocks, the action symmetry, collapse."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from torch.nn import functional as F
+
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
+from sb3_eqr.common.losses import normalized_distance
+from sb3_eqr.common.type_aliases import PyTorchObs
+from sb3_eqr.visualize import measures
+from sb3_eqr.visualize.latents import Latents, _eval_mode, coordinate_names, coordinates, encode, frame, split
+
+DORMANT = 0.025  # Sokar et al. 2023, https://arxiv.org/abs/2302.12902
+
+
+class Motion(NamedTuple):
+    """How far actions move blocks. K counts the blocks of all groups."""
+
+    predicted: np.ndarray  # (A, K): mean ‖κ(x, a) · x − x‖ in the block, over all states
+    observed: np.ndarray  # (A, K): mean ‖x₁ − x₀‖ in the block, where a was played; NaN where it never was
+
+
+class Generators(NamedTuple):
+    """The elements κ(x, a) of the blocks of one group, in coordinates that are 0 at the identity."""
+
+    group: str
+    names: list[str]  # of the coordinates, (C,)
+    mean: np.ndarray  # (A, K, C), over states; circular for the angle of a plane
+    std: np.ndarray  # (A, K, C)
+
+
+class Disentanglement(NamedTuple):
+    """Whether actions, blocks and factors go one with one."""
+
+    opposites: list[int]  # (A,): the action that undoes each action, or itself
+    specificity: np.ndarray  # (K,): 1 − H / log A of a block's motion over actions, opposites taken as one
+    redundancy: np.ndarray  # (K, K): mean canonical correlation between blocks
+    information: np.ndarray | None  # (K, F): of block and factor, over the factor's entropy; None: factors unknown
+    gap: np.ndarray | None  # (F,): mutual information gap
+
+
+class ActionSymmetry(NamedTuple):
+    """Mean distance of Eq. 19 between b(τ_g · x̂₁) and b(ρ(τ_g) · κ(x₀, a) · x_j), over random pairs."""
+
+    distance: float
+    identity: float  # the identity in place of ρ
+    shuffled: float  # against the right-hand side of another pair
+    from_identity: float  # mean ‖ρ(τ_g) − 1‖ per block
+
+
+class Collapse(NamedTuple):
+    """How much of the latent space is used."""
+
+    size: float  # root mean square ‖x‖
+    spread: float  # root mean square ‖x − mean x‖, over the size
+    effective_rank: float  # of the centred states
+    dimensions: int  # D
+    spectrum: np.ndarray  # (min(N, D),): standard deviations along the principal axes
+    n_units: int  # outputs of the trunk
+    dead_units: float  # fraction of them that are constant over all observations
+    dormant_units: float  # fraction with mean |h| ≤ 0.025 of the layer's mean
+
+
+def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
+    """
+    Distances in the block rather than sizes of κ: they exist for every group, "none" as well, and are in the units of the
+    transition's error.
+
+    :param states: (n, D)
+    :param elements: κ of every action there, (n, A, K, ...)
+    """
+    latent_model = model.policy.latent_model
+    n_actions = latent_model.n_actions
+    before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
+    moved = latent_model.act(elements.flatten(0, 1), before)
+    predicted = _block_norms(model, moved - before).unflatten(0, (-1, n_actions)).mean(dim=0)  # (A, K)
+    steps = _block_norms(model, data.next_states[:, 0] - data.states)  # (N, K)
+    played = F.one_hot(data.actions[:, 0], n_actions).to(steps.dtype)  # (N, A)
+    observed = played.T @ steps / played.sum(dim=0)[:, None]  # 0 / 0 where never played
+    return Motion(_numpy(predicted), _numpy(observed))
+
+
+def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators]:
+    """
+    :param elements: κ of every action in n states, (n, A, K, ...)
+    """
+    found = []
+    for group, blocks in split(model, elements):
+        values = coordinates(group, blocks)  # (n, A, K, C)
+        mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
+        names = coordinate_names(group)
+        matrix, _ = frame(group, blocks)
+        if names[0].startswith("angle") and matrix is not None and matrix.shape[-1] == 2:
+            mean[..., 0], std[..., 0] = measures.angle_moments(values[..., 0])
+        found.append(Generators(str(group), names, _numpy(mean), _numpy(std)))
+    return found
+
+
+def find_disentanglement(
+    model: EqRAlgorithm, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
+) -> Disentanglement:
+    """
+    A block's information on a factor is that of its turn or of its shift, whichever has more: each is less than the whole's.
+
+    :param states: (N, D)
+    :param factors: (N, F), where known
+    """
+    vectors = np.concatenate([part.mean.reshape(len(part.mean), -1) for part in generators], axis=1)  # (A, ...)
+    opposites = measures.opposites(vectors)
+    blocks = [(group, found[:, i]) for group, found in split(model, states) for i in range(found.shape[1])]
+    n = len(blocks)
+    redundancy = np.eye(n)
+    for i in range(n):
+        for j in range(i):
+            pair = (blocks[i][1].flatten(1), blocks[j][1].flatten(1))
+            redundancy[i, j] = redundancy[j, i] = measures.canonical_correlation(*pair)
+    information = gap = None
+    if factors is not None:
+        labels = [[measures.cells(part.flatten(1)) for part in frame(*block) if part is not None] for block in blocks]
+        binned = [measures.bins(factor) for factor in factors.T]
+        information = np.array([[_information(parts, factor) for factor in binned] for parts in labels])
+        gap = measures.information_gap(information)
+    specificity = measures.concentration(measures.merged(motion.predicted, opposites), axis=0)
+    return Disentanglement(opposites, specificity, redundancy, information, gap)
+
+
+def _information(parts: list[np.ndarray], factor: np.ndarray) -> float:
+    whole = measures.entropy(factor)
+    return max(measures.mutual_information(part, factor) for part in parts) / whole if whole > 0 else np.nan
+
+
+def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Generator) -> ActionSymmetry | None:
+    """
+    ρ's effect in Eq. 19, by the online networks throughout.
+
+    :param rng: draws each state's partner
+    """
+    latent_model = model.policy.latent_model
+    group, n = latent_model.group, len(data.states)
+    if not group.has_inverse or n < 2:
+        return None
+    order = rng.permutation(n)
+    partner = np.empty(n, dtype=int)
+    partner[order] = np.roll(order, 1)  # never itself
+    state, other = (x.unflatten(1, (-1, *group.element_shape)) for x in (data.states, data.states[partner]))
+    with th.no_grad(), _eval_mode(model):
+        symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
+        params = latent_model.action_symmetry(symmetry.flatten(1))
+        rho = group.element(params.unflatten(1, (-1, group.num_params)))
+        one_hot = F.one_hot(data.actions[:, 0], latent_model.n_actions).to(data.states.dtype)
+        kappa = latent_model.action_element(data.states, one_hot)
+        left = latent_model.projection(latent_model.act(symmetry, data.predicted[:, 0]))
+        right, plain = (
+            latent_model.projection(latent_model.act(element, data.states[partner]))
+            for element in (group.compose(rho, kappa), kappa)
+        )
+        distances = [normalized_distance(left, x) for x in (right, plain, right[partner])]
+    away = _block_norms(model, (rho - group.identity(dtype=rho.dtype, device=rho.device)).flatten(1))
+    return ActionSymmetry(*(float(x.mean()) for x in distances), from_identity=float(away.mean()))
+
+
+def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchObs) -> Collapse:
+    """
+    :param states: (N, D)
+    :param observations: the N they are of
+    """
+    size = float(states.double().square().sum(dim=1).mean().sqrt())
+    spectrum = measures.spectrum(states)
+    spread = float(np.linalg.norm(spectrum)) / size if size > 0 else 0.0
+    low, high, mean = _activity(model, observations)  # (U,) each
+    dead = high - low <= measures.ROUNDING * th.maximum(high.abs(), low.abs())
+    dormant = mean <= DORMANT * mean.mean()
+    rank = measures.effective_rank(spectrum, size)
+    fractions = [float(x.double().mean()) for x in (dead, dormant)]
+    return Collapse(size, spread, rank, states.shape[1], spectrum, len(dead), *fractions)
+
+
+def _activity(model: EqRAlgorithm, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """:return: least, greatest and mean absolute output of each unit of the trunk, (U,) each"""
+    extractor = model.policy.online.features_extractor
+    trunk = extractor.trunk if isinstance(extractor, GroupFeaturesExtractor) else extractor
+    seen: list[tuple[th.Tensor, th.Tensor, th.Tensor, int]] = []
+
+    def note(_module: th.nn.Module, _inputs: tuple, output: th.Tensor) -> None:
+        h = output.flatten(1)
+        seen.append((h.amin(dim=0), h.amax(dim=0), h.abs().sum(dim=0), len(h)))
+
+    hook = trunk.register_forward_hook(note)
+    try:
+        encode(model, observations)
+    finally:
+        hook.remove()
+    low, high, total = (th.stack(rows) for rows in list(zip(*seen, strict=True))[:3])
+    return low.amin(dim=0), high.amax(dim=0), total.sum(dim=0) / sum(row[3] for row in seen)
+
+
+def _block_norms(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
+    """
+    :param states: flat, (N, D)
+    :return: (N, K)
+    """
+    return th.cat([found.flatten(2).norm(dim=2) for _, found in split(model, states)], dim=1)
+
+
+def _numpy(tensor: th.Tensor) -> np.ndarray:
+    return tensor.double().cpu().numpy()

@@ -1,0 +1,263 @@
+"""Pure functions of tensors behind the diagnostics: errors, correlations, information, rank. None draws a random number."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+ROUNDING = 1e-6  # what varies by less than this part of its size is rounding in single precision
+RANK_TOLERANCE = 1e-3  # directions in which a block varies by less than this part of its widest one are none
+BINS = 10  # of a true factor
+CELLS = 32  # of a block
+
+
+class Transition(NamedTuple):
+    """Errors of the rollout, one number per step ahead, m = 1 ... M."""
+
+    error: np.ndarray  # (M,): mean ‖x̂_m − x_m‖²
+    shuffled: np.ndarray  # (M,): the same against the x_m of any window: what knowing the average alone gives
+    still: np.ndarray  # (M,): mean ‖x₀ − x_m‖²: what predicting no motion gives
+    skill: np.ndarray  # (M,): 1 − error / shuffled; NaN where all states are one
+    gain: np.ndarray  # (M,): 1 − error / still; NaN where nothing moves
+    n_windows: np.ndarray  # (M,), int: how many windows reach that far
+
+
+class Rewards(NamedTuple):
+    """Errors of the predicted reward, one number per step ahead, m = 1 ... M."""
+
+    error: np.ndarray  # (M,): mean (r_ψ(x̂_m) − r_{t+m})²
+    constant: np.ndarray  # (M,): the same of the mean reward
+    explained: np.ndarray  # (M,): 1 − Var[r − r_ψ] / Var[r]; NaN where no reward varies
+
+
+def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Tensor, mask: th.Tensor) -> Transition:
+    """
+    Equivariance error of the transition, x̂_m against x_m, beside two predictors that know nothing of the actions.
+    The shuffled one is the mean over all pairs of windows, Var[x̂] + Var[x] + ‖mean x̂ − mean x‖², so nothing is drawn.
+
+    :param states: x₀, (N, D)
+    :param next_states: x₁ ... x_M, (N, M, D)
+    :param predicted: x̂₁ ... x̂_M, (N, M, D)
+    :param mask: (N, M), 1 where the window counts
+    """
+    rows = []
+    for m in range(mask.shape[1]):
+        valid = mask[:, m] > 0
+        start, true, guess = (x[valid].double() for x in (states, next_states[:, m], predicted[:, m]))  # (n, D) each
+        if not len(true):
+            rows.append((np.nan, np.nan, np.nan, np.nan, 0))
+            continue
+        shift = (guess.mean(dim=0) - true.mean(dim=0)).square().sum()
+        shuffled = guess.var(dim=0, correction=0).sum() + true.var(dim=0, correction=0).sum() + shift
+        error, still = (_mean_square(x, true) for x in (guess, start))
+        rows.append((error, float(shuffled), still, float(true.square().sum(dim=1).mean()), len(true)))
+    error, shuffled, still, size, n = np.array(rows, dtype=np.float64).T  # (M,) each
+    floor = ROUNDING**2 * size
+    return Transition(error, shuffled, still, _one_less(error, shuffled, floor), _one_less(error, still, floor), n.astype(int))
+
+
+def reward_error(predicted: th.Tensor, rewards: th.Tensor, mask: th.Tensor) -> Rewards:
+    """
+    Reward prediction beside the constant mean; the explained variance is SB3's.
+
+    :param predicted: (N, M)
+    :param rewards: (N, M)
+    :param mask: (N, M), 1 where the window counts
+    """
+    rows = []
+    for m in range(mask.shape[1]):
+        valid = mask[:, m] > 0
+        guess, true = predicted[valid, m].double(), rewards[valid, m].double()
+        error = true - guess
+        variance = float(true.var(correction=0)) if len(true) else np.nan
+        left = float(error.var(correction=0)) if len(true) else np.nan
+        rows.append((float(error.square().mean()), variance, left))
+    found, constant, left = np.array(rows).T
+    return Rewards(found, constant, _one_less(left, constant, np.full_like(constant, ROUNDING**2)))
+
+
+def _mean_square(left: th.Tensor, right: th.Tensor) -> float:
+    return float((left - right).square().sum(dim=1).mean())
+
+
+def _one_less(numerator: np.ndarray, denominator: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """:return: 1 − numerator / denominator, NaN where the denominator is rounding"""
+    known = denominator > floor
+    return np.where(known, 1 - numerator / np.where(known, denominator, 1), np.nan)
+
+
+def angle_moments(angles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Circular mean and standard deviation, √(−2 ln R) with R the length of the mean unit vector (Mardia and Jupp 2000, §2.3).
+
+    :param angles: radians, (N, ...)
+    :return: (...), (...)
+    """
+    sin, cos = angles.sin().mean(dim=0), angles.cos().mean(dim=0)
+    length = th.hypot(sin, cos).clamp(min=1e-12, max=1)
+    return th.atan2(sin, cos), (-2 * length.log()).clamp(min=0).sqrt()
+
+
+def concentration(weights: np.ndarray, axis: int) -> np.ndarray:
+    """
+    1 − H / log n of weights that are made to sum to 1: 1 where one entry has all, 0 where all have the same.
+
+    :param weights: ≥ 0
+    :param axis: n entries
+    :return: without that axis; NaN where n is 1 or all weights are 0
+    """
+    total = weights.sum(axis=axis, keepdims=True)
+    n = weights.shape[axis]
+    if n < 2:
+        return np.full(total.squeeze(axis).shape, np.nan)
+    p = np.where(total > 0, weights / np.where(total > 0, total, 1), np.nan)
+    log_p = np.log(np.where(p > 0, p, 1))
+    return 1 + (p * log_p).sum(axis=axis) / np.log(n)
+
+
+def opposites(generators: np.ndarray, least: float = 0.8) -> list[int]:
+    """
+    Which action undoes which: two that are each other's most opposed, with a cosine below −``least``.
+
+    :param generators: mean coordinates of each action's element, (A, C)
+    :param least: how opposed they must be
+    :return: for each action its opposite, or itself, (A,)
+    """
+    norms = np.linalg.norm(generators, axis=1, keepdims=True)
+    unit = generators / np.where(norms > 0, norms, 1)
+    cosine = unit @ unit.T  # (A, A)
+    nearest = cosine.argmin(axis=1)
+    return [int(b) if nearest[b] == a and cosine[a, b] < -least else a for a, b in enumerate(nearest)]
+
+
+def merged(weights: np.ndarray, pairs: list[int]) -> np.ndarray:
+    """
+    :param weights: (A, K)
+    :param pairs: of :func:`opposites`
+    :return: (A', K), each action averaged with its opposite
+    """
+    return np.stack([(weights[a] + weights[b]) / 2 for a, b in enumerate(pairs) if a <= b])
+
+
+def canonical_correlation(first: th.Tensor, second: th.Tensor) -> float:
+    """
+    Mean canonical correlation (Hotelling 1936): that of the best matched linear combinations, over the smaller number of
+    directions in which either varies. 1: one can be read off the other linearly; 0: uncorrelated.
+
+    :param first: (N, d)
+    :param second: (N, e)
+    :return: in [0, 1]; 0 where either is constant
+    """
+    bases = [_directions(x) for x in (first, second)]
+    rank = min(basis.shape[1] for basis in bases)
+    if rank == 0:
+        return 0.0
+    return float(th.linalg.svdvals(bases[0].T @ bases[1])[:rank].clamp(max=1).mean())
+
+
+def _directions(x: th.Tensor) -> th.Tensor:
+    """:return: an orthonormal basis of what varies, (N, rank)"""
+    x = x.double()
+    centred = x - x.mean(dim=0)
+    left, values, _ = th.linalg.svd(centred, full_matrices=False)
+    kept = (values > RANK_TOLERANCE * values[0]) & (values > ROUNDING * th.linalg.matrix_norm(x))
+    return left[:, kept]
+
+
+def bins(values: np.ndarray, n_bins: int = BINS) -> np.ndarray:
+    """
+    Bins that hold about equally many. Any cut of a circle is as good as another, so angles need no care.
+
+    :param values: (N,)
+    :param n_bins: at most so many
+    :return: labels, (N,), int
+    """
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, n_bins + 1)[1:-1]))
+    return np.searchsorted(edges, values, side="right")
+
+
+def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np.ndarray:
+    """
+    Bins in any number of dimensions: k-means (Lloyd 1982) from points that are each the farthest from those before. On the
+    entries of a rotation a circle has no edge.
+
+    :param points: (N, d)
+    :param n_cells: at most so many
+    :return: labels, (N,), int; all 0 where the points are one
+    """
+    x = points.double()
+    x = x - x.mean(dim=0)
+    if float(x.norm()) <= ROUNDING * float(points.double().norm()):
+        return np.zeros(len(x), dtype=int)
+    chosen = [int(x.square().sum(dim=1).argmax())]
+    nearest = (x - x[chosen[0]]).square().sum(dim=1)  # (N,)
+    for _ in range(n_cells - 1):
+        chosen.append(int(nearest.argmax()))
+        nearest = th.minimum(nearest, (x - x[chosen[-1]]).square().sum(dim=1))
+    centres = x[chosen]
+    for _ in range(n_iterations):
+        labels = th.cdist(x, centres).argmin(dim=1)  # (N,)
+        counts = th.bincount(labels, minlength=n_cells)[:, None]
+        sums = th.zeros_like(centres).index_add_(0, labels, x)
+        centres = th.where(counts > 0, sums / counts.clamp(min=1), centres)
+    return th.cdist(x, centres).argmin(dim=1).cpu().numpy()
+
+
+def entropy(labels: np.ndarray) -> float:
+    """
+    In nats, with Miller's (1955) correction for few samples: (occupied labels − 1) / 2N is added.
+
+    :param labels: (N,), int
+    """
+    _, counts = np.unique(labels, return_counts=True)
+    p = counts / len(labels)
+    return float(-(p * np.log(p)).sum() + (len(counts) - 1) / (2 * len(labels)))
+
+
+def mutual_information(first: np.ndarray, second: np.ndarray) -> float:
+    """
+    I = H(a) + H(b) − H(a, b), in nats; at least 0.
+
+    :param first: labels a, (N,), int ≥ 0
+    :param second: labels b, (N,), int ≥ 0
+    """
+    joint = first * (int(second.max()) + 1) + second
+    return max(entropy(first) + entropy(second) - entropy(joint), 0.0)
+
+
+def information_gap(information: np.ndarray) -> np.ndarray:
+    """
+    How much more the best block knows of each factor than the second best (Chen et al. 2018, Eq. 6, for blocks:
+    https://arxiv.org/abs/1802.04942).
+
+    :param information: normalised by each factor's entropy, (K, F)
+    :return: (F,); NaN where there is one block
+    """
+    if len(information) < 2:
+        return np.full(information.shape[1], np.nan)
+    ordered = np.sort(information, axis=0)
+    return ordered[-1] - ordered[-2]
+
+
+def spectrum(states: th.Tensor) -> np.ndarray:
+    """
+    :param states: (N, D)
+    :return: singular values of the centred states over √N, (min(N, D),): standard deviations along the principal axes
+    """
+    x = states.double()
+    return th.linalg.svdvals((x - x.mean(dim=0)) / len(x) ** 0.5).cpu().numpy()
+
+
+def effective_rank(values: np.ndarray, size: float = 0.0) -> float:
+    """
+    exp of the entropy of the normalised singular values (Roy and Vetterli 2007).
+
+    :param values: singular values, ≥ 0
+    :param size: of the states; values that are rounding beside it do not count
+    :return: in [1, len(values)]; 0 where there is nothing
+    """
+    counted = values[values > ROUNDING * size]
+    if not counted.sum():
+        return 0.0
+    p = counted / counted.sum()
+    return float(np.exp(-(p * np.log(np.where(p > 0, p, 1))).sum()))

@@ -1,0 +1,402 @@
+"""The pixel worlds: sliding ball, pendulum, star field."""
+
+import json
+import time
+import warnings
+from math import pi, sqrt
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control import PendulumEnv
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_eqr import EqRQRDQN, envs
+from sb3_eqr.envs import PixelPendulum, SlidingBall, StarField
+from sb3_eqr.envs.star_field import MOVE, NEAR, STAR_RADIUS, TURN, VIEW, orthonormalized, quaternion_rotation
+from tests.models import SMALL
+
+IDS = ["SlidingBall-v0", "SlidingBallTorus-v0", "PixelPendulum-v0", "StarField-v0", "StarFieldRotations-v0"]
+CHANNELS = dict(zip(IDS, [1, 1, 2, 3, 3], strict=True))
+N_ACTIONS = dict(zip(IDS, [2, 4, 3, 12, 6], strict=True))
+FORWARD, BACK, RIGHT, LEFT, UP, DOWN = range(6, 12)
+
+envs.register()
+on_every_world = pytest.mark.parametrize("env_id", IDS)
+
+
+def assert_same_picture(picture, other):
+    """Up to the rounding of a pixel's last bit."""
+    np.testing.assert_allclose(picture.astype(int), other.astype(int), atol=1)
+
+
+@on_every_world
+def test_the_environment_is_one(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+    env = gym.make(env_id, render_mode="rgb_array")
+    assert env.observation_space == gym.spaces.Box(0, 255, (48, 48, CHANNELS[env_id]), np.uint8)
+    assert env.action_space == gym.spaces.Discrete(N_ACTIONS[env_id])
+    assert env.spec.max_episode_steps == (200 if env_id == "PixelPendulum-v0" else 100)
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (192, 192, 3) and picture.dtype == np.uint8 and picture.max() > 100
+    assert gym.make(env_id).unwrapped.render() is None
+    gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
+
+
+@on_every_world
+def test_the_seed_decides(env_id):
+    def play(seed):
+        env = gym.make(env_id)
+        rng = np.random.default_rng(7)
+        observations = [env.reset(seed=seed)[0], env.reset()[0]]
+        for _ in range(20):
+            observations.append(env.step(rng.integers(N_ACTIONS[env_id]))[0])
+        return np.array(observations)
+
+    first = play(3)
+    assert (first == play(3)).all()
+    assert (first[0] != play(4)[0]).any() and (first[0] != first[1]).any()
+    assert first.max() > 100
+
+
+@on_every_world
+def test_an_agent_can_be_built(env_id):
+    model = EqRQRDQN("CnnPolicy", make_vec_env(env_id), **SMALL)
+    actions, _ = model.predict(model.env.reset())
+    assert 0 <= actions[0] < N_ACTIONS[env_id]
+    gym_env = gym.make(env_id)
+    observation, _ = gym_env.reset(seed=0)
+    gym_env.step(model.predict(observation)[0])  # an array of shape ()
+
+
+@on_every_world
+def test_a_step_is_fast(env_id):
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=0)
+    seconds = []
+    for step in range(60):
+        start = time.perf_counter()
+        env.step(step % N_ACTIONS[env_id])
+        seconds.append(time.perf_counter() - start)
+    assert np.median(seconds) < 0.002  # a tenth of it on a core of its own
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: SlidingBall(3), r"dimensions: expected a whole number in \[1, 2\], found 3"),
+        (lambda: SlidingBall(size=35), "size: expected a whole number of at least 36, found 35"),
+        (lambda: SlidingBall(n_steps=2), "n_steps: expected a whole number of at least 3, found 2"),
+        (lambda: SlidingBall(goal=[1.0]), r"goal: expected 1 numbers in \[0, 1\), found \[1.0\]"),
+        (lambda: SlidingBall(goal=[0.1, 0.2]), r"goal: expected 1 numbers in \[0, 1\), found \[0.1, 0.2\]"),
+        (lambda: SlidingBall(2).draw([0.1, np.nan]), r"position: expected 2 numbers in \[0, 1\), found \[0.1, nan\]"),
+        (lambda: SlidingBall().reset(options={"position": ["a"]}), "position: expected 1 numbers"),
+        (lambda: SlidingBall().reset(options={"place": [0]}), "options: expected none but position, found 'place'"),
+        (lambda: SlidingBall().step(2), r"action: expected one of Discrete\(2\), found 2"),
+        (lambda: PixelPendulum(size=35.0), "size: expected a whole number of at least 36, found 35.0"),
+        (lambda: PixelPendulum(n_torques=1), "n_torques: expected a whole number of at least 3, found 1"),
+        (lambda: PixelPendulum(n_torques=4), "n_torques: expected an odd number, so that the middle one is 0, found 4"),
+        (
+            lambda: PixelPendulum().reset(options={"velocity": 9}),
+            r"velocity: expected a finite number in \[-8.0, 8.0\], found 9",
+        ),
+        (lambda: PixelPendulum().reset(options={"angle": np.inf}), "angle: expected a finite number, found inf"),
+        (lambda: PixelPendulum().step(-1), r"action: expected one of Discrete\(3\), found -1"),
+        (lambda: StarField(size=0), "size: expected a whole number of at least 36, found 0"),
+        (lambda: StarField(n_stars=0), "n_stars: expected a whole number of at least 1, found 0"),
+        (lambda: StarField(layout_seed=-1), "layout_seed: expected a whole number of at least 0, found -1"),
+        (lambda: StarField().reset(options={"rotation": -np.eye(3)}), "rotation: expected a rotation matrix"),
+        (lambda: StarField().reset(options={"rotation": 2 * np.eye(3)}), "rotation: expected a rotation matrix"),
+        (lambda: StarField().reset(options={"translation": [0, 0, 1]}), r"translation: expected 3 numbers in \[0, 1\)"),
+        (
+            lambda: StarField(False).reset(options={"translation": [0, 0, 0]}),
+            "expected none but rotation, found 'translation'",
+        ),
+        (lambda: StarField(False).step(6), r"action: expected one of Discrete\(6\), found 6"),
+    ],
+)
+def test_what_is_not_legal_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_ball_moves_one_step_per_action():
+    env = SlidingBall(n_steps=5)
+    first, info = env.reset(options={"position": [0.3]})
+    assert info["position"] == [0.3]
+    for place in (0.1, 0.9, 0.7, 0.5, 0.3):
+        observation, reward, terminated, truncated, info = env.step(0)
+        np.testing.assert_allclose(info["position"], [place])
+        assert (reward, terminated, truncated) == (0.0, False, False)
+        assert (observation == env.draw(info["position"])).all()
+    assert info["position"] == [0.3] and (observation == first).all()
+    assert (env.step(1)[0] != first).any()
+    np.testing.assert_allclose(env.position, [0.5])
+    assert (env.step(0)[0] == first).all()
+    places = np.array([env.reset(seed=seed)[1]["position"][0] for seed in range(200)])
+    assert (np.histogram(places, 4, (0, 1))[0] > 30).all()
+
+
+def test_up_is_up_and_left_is_left():
+    env = SlidingBall(2, n_steps=8)
+    for action, shift in enumerate([(-6, 0), (6, 0), (0, -6), (0, 6)]):  # 48 pixels in eight steps
+        first, _ = env.reset(options={"position": [0.5, 0.25]})
+        assert (env.step(action)[0] == np.roll(first, shift, axis=(0, 1))).all()
+
+
+def test_the_disc_is_whole_everywhere():
+    env = SlidingBall(2)
+    middle = env.draw([0.5, 0.5])[:, :, 0]
+    assert middle[24, 24] == 255 and middle[24, 19] == 255 and middle[24, 16] == 0  # radius 6 about (24, 24)
+    assert (env.draw([0, 0])[:, :, 0] == np.roll(middle, (24, 24), axis=(0, 1))).all()
+    sums = [env.draw(place).sum() / 255 for place in np.random.default_rng(0).random((200, 2))]
+    np.testing.assert_allclose(sums, pi * 6**2, rtol=0.01)
+    one = SlidingBall()
+    assert (one.draw([0.5])[:, :, 0] == middle).all()
+    np.testing.assert_allclose([one.draw([place]).sum() / 255 for place in np.linspace(0, 0.999, 97)], pi * 6**2, rtol=0.01)
+
+
+def test_the_steps_of_the_torus_commute():
+    env = SlidingBall(2, n_steps=7)
+    walk = np.random.default_rng(1).integers(0, 4, 50)
+    ends = []
+    for actions in (walk, walk[::-1], np.sort(walk)):
+        env.reset(seed=5)
+        for action in actions:
+            observation, _, _, _, info = env.step(action)
+        ends.append((observation, info["position"]))
+    assert all((observation == ends[0][0]).all() and (place == ends[0][1]).all() for observation, place in ends)
+
+
+def test_the_goal():
+    env = SlidingBall(goal=[0.98], n_steps=10, render_mode="rgb_array")
+    env.reset(options={"position": [0.15]})
+    assert env.step(0)[1:3] == (0.0, False)  # 0.05: by 0.07 away, around the edge
+    assert env.step(0)[1:3] == (1.0, True)  # 0.95
+    assert (env.render()[:, :, 1].astype(int) - env.render()[:, :, 0]).max() > 80
+    env = SlidingBall(2, n_steps=4, goal=(0.5, 0.5))
+    env.reset(options={"position": [0.25, 0.75]})
+    assert env.step(1)[1:3] == (0.0, False)  # right in one axis
+    assert env.step(2)[1:3] == (1.0, True)
+    env = SlidingBall(n_steps=3, goal=[0.5])
+    starts = np.array([env.reset(seed=seed)[1]["position"][0] for seed in range(100)])
+    assert (abs(starts - 0.5) > 1 / 6).all()
+
+
+def test_the_pendulum_is_gymnasiums():
+    env, other = PixelPendulum(n_torques=5), PendulumEnv()
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        other.reset()
+        other.state = np.array([info["angle"], info["velocity"]])
+        for action in rng.integers(0, 5, 100):
+            _, reward, terminated, truncated, info = env.step(action)
+            _, expected, *_ = other.step(np.array([action - 2.0]))
+            np.testing.assert_allclose(np.exp(1j * info["angle"]), np.exp(1j * other.state[0]), atol=1e-9)
+            np.testing.assert_allclose([info["velocity"], reward], [other.state[1], expected], atol=1e-9)
+            assert -pi <= info["angle"] <= pi and not (terminated or truncated)
+
+
+def test_the_free_pendulum():
+    env = PixelPendulum(gravity=False, n_torques=5)
+    env.reset(options={"angle": 0.3, "velocity": 2.0})
+    for _ in range(20):  # one second: energy ω²/6 stays, to the last bit
+        _, reward, _, _, info = env.step(2)
+        assert info["velocity"] == 2.0 and reward == 0
+    np.testing.assert_allclose(info["angle"], 2.3)
+    np.testing.assert_allclose(env.step(4)[4]["velocity"], 2.75)  # 3 · 5 · 0.05 more
+    np.testing.assert_allclose(env.step(1)[4]["velocity"], 2.375)
+    for _ in range(20):
+        info = env.step(4)[4]
+    assert info["velocity"] == 8  # clipped
+
+
+def test_a_swing_keeps_its_energy():
+    env = PixelPendulum()
+    env.reset(options={"angle": pi / 2, "velocity": 0})
+    info = env.step(1)[4]
+    np.testing.assert_allclose([info["velocity"], info["angle"]], [0.75, pi / 2 + 0.0375])  # 15 · 0.05; 0.75 · 0.05
+    states = np.array([list(env.step(1)[4].values()) for _ in range(2000)])
+    # Let go level: at the bottom mgl/2 = 5 = ω²/6. The method is of first order, so the energy swings, but does not drift.
+    np.testing.assert_allclose(abs(states[:, 1]).max(), sqrt(30), rtol=0.02)
+    energy = states[:, 1] ** 2 / 6 + 5 * np.cos(states[:, 0])
+    assert abs(energy).max() < 1.1 and abs(energy[-500:].mean() - energy[:500].mean()) < 0.05
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_the_mirror(gravity):
+    env, mirror = PixelPendulum(gravity, n_torques=7), PixelPendulum(gravity, n_torques=7)
+    first, info = env.reset(seed=2)
+    other, _ = mirror.reset(options={key: -value for key, value in info.items()})
+    assert (first == other[:, ::-1]).all()
+    assert env.torques[3] == 0 and (env.torques == -env.torques[::-1]).all() and (np.diff(env.torques) > 0).all()
+    for action in np.random.default_rng(3).integers(0, 7, 300):
+        observation, reward, _, _, info = env.step(action)
+        other, mirrored_reward, _, _, mirrored = mirror.step(6 - action)
+        assert info == {key: -value for key, value in mirrored.items()} and reward == mirrored_reward
+        assert (observation == other[:, ::-1]).all()
+
+
+def test_turning_the_free_pendulum_changes_no_torque():
+    env, turned = PixelPendulum(gravity=False), PixelPendulum(gravity=False)
+    _, info = env.reset(seed=4)
+    turned.reset(options={"angle": info["angle"] + pi / 2, "velocity": info["velocity"]})
+    for action in np.random.default_rng(3).integers(0, 3, 100):
+        observation, other = env.step(action)[0], turned.step(action)[0]
+        assert_same_picture(np.rot90(observation), other)  # anticlockwise
+
+
+def test_the_velocity_is_seen():
+    env = PixelPendulum()
+    present, _ = env.reset(options={"angle": 3.0, "velocity": 5.0})
+    for action in (2, 1, 0):
+        previous, present = present, env.step(action)[0]
+        assert_same_picture(present[:, :, 0], previous[:, :, 1])
+    upright = env.draw(0.0, 0.0)
+    assert (upright[:, :, 0] == upright[:, :, 1]).all()
+    assert upright[6, 23:25].min() == 255 and upright[30:].max() == 0  # the rod ends at row 24 − 19
+    left = env.draw(pi / 2, 0.0)[:, :, 1]
+    assert left[23:25, 6].min() == 255 and left[:, 30:].max() == 0
+    # What an action changes can be seen one step later.
+    free = PixelPendulum(gravity=False)
+    pictures = []
+    for action in range(3):
+        free.reset(options={"angle": 1.0, "velocity": 1.0})
+        pictures.append(free.step(action)[0][:, :, 1].astype(int))
+    assert min(abs(pictures[0] - pictures[1]).max(), abs(pictures[1] - pictures[2]).max()) > 60
+
+
+def test_there_and_back_among_stars():
+    env = StarField()
+    first, info = env.reset(seed=0)
+    for action in range(12):
+        away, _, _, _, moved = env.step(action)
+        assert (away != first).any()
+        distance = moved["translation"] - info["translation"]
+        np.testing.assert_allclose(np.linalg.norm(distance - np.rint(distance)), MOVE if action > 5 else 0, atol=1e-12)
+        angle = np.arccos((np.trace(moved["rotation"].T @ info["rotation"]) - 1) / 2)
+        np.testing.assert_allclose(angle, 0 if action > 5 else TURN, atol=1e-6)
+        back, reward, terminated, truncated, _ = env.step(action ^ 1)
+        assert_same_picture(first, back)
+        assert (reward, terminated, truncated) == (0.0, False, False)
+
+
+def test_a_full_turn_and_a_whole_cube():
+    env = StarField()
+    for action in range(6):
+        first, _ = env.reset(seed=action)
+        for _ in range(32):
+            observation = env.step(action)[0]
+        assert_same_picture(first, observation)
+    for action in range(6, 12):
+        first, _ = env.reset(options={"rotation": np.eye(3)})
+        for _ in range(20):
+            observation, _, _, _, moved = env.step(action)
+        assert_same_picture(first, observation)
+        assert ((0 <= moved["translation"]) & (moved["translation"] < 1)).all()
+
+
+def test_a_star_moves_as_its_action_says():
+    """One star right ahead goes where the camera does not; places by hand."""
+    env = StarField(n_stars=1)
+    env.colours[:] = 1
+    ahead, angle = 0.25, TURN
+    shift = 24 * np.tan(angle), 24 * MOVE / ahead  # pixels, with the focal length of 24 that 90° need
+    places = {0: (shift[0], 0), 1: (-shift[0], 0), 2: (0, -shift[0]), 3: (0, shift[0]), 4: (0, 0), 5: (0, 0)}
+    places |= {FORWARD: (0, 0), BACK: (0, 0), RIGHT: (0, -shift[1]), LEFT: (0, shift[1])}
+    places |= {UP: (shift[1], 0), DOWN: (-shift[1], 0)}
+    for seed, (action, place) in enumerate(places.items()):
+        _, info = env.reset(seed=seed)
+        env.places[:] = (info["translation"] + ahead * info["rotation"][:, 2]) % 1
+        picture = env.step(action)[0][:, :, 0].astype(float)
+        rows, columns = np.indices(picture.shape) + 0.5 - 24
+        centre = np.array([(rows * picture).sum(), (columns * picture).sum()]) / picture.sum()
+        np.testing.assert_allclose(centre, place, atol=0.2, err_msg=f"action {action}")
+    env.reset(options={"rotation": np.eye(3), "translation": [0, 0, 0]})
+    sizes = []
+    for depth in (0.15, 0.3):
+        env.places[:] = (0, 0, depth)
+        picture = env.draw(env.rotation, env.translation)
+        np.testing.assert_allclose(picture.sum() / picture.max() / 3, pi * (24 * STAR_RADIUS / depth) ** 2, rtol=0.05)
+        sizes.append(picture.max())
+    assert sizes[0] > sizes[1]
+    env.places[:] = (0, 0, -0.2)
+    assert env.draw(env.rotation, env.translation).max() == 0  # behind the camera
+
+
+def test_rolling_turns_the_picture():
+    env = StarField(translations=False)
+    for seed in range(3):
+        first, _ = env.reset(seed=seed)
+        for _ in range(8):  # a quarter
+            observation = env.step(4)[0]
+        assert_same_picture(np.rot90(first), observation)  # the camera clockwise, so the picture anticlockwise
+
+
+def picture_by_loops(env, rotation, translation):
+    """The same picture pixel by pixel and star by star, far to near."""
+    inverse = np.linalg.inv(np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
+    size = env.size
+    copies = []
+    for place, colour in zip(env.places, env.colours, strict=True):
+        for cell in np.ndindex(3, 3, 3):
+            x, y, z, _ = inverse @ np.append(place + cell - 1, 1)
+            distance = sqrt(x * x + y * y + z * z)
+            if distance < VIEW and z > NEAR:
+                copies.append((distance, x, y, z, colour))
+    picture = np.zeros((size, size, 3))
+    for distance, x, y, z, colour in sorted(copies, key=lambda copy: -copy[0]):
+        radius = STAR_RADIUS * size / 2 / z
+        for row, column in np.ndindex(size, size):
+            away = np.hypot(row + 0.5 - size / 2 * (1 + y / z), column + 0.5 - size / 2 * (1 + x / z))
+            alpha = min(max(radius + 0.5 - away, 0), 1) * min(max(z / NEAR - 1, 0), 1)
+            picture[row, column] += alpha * (colour * (1 - (distance / VIEW) ** 4) - picture[row, column])
+    return picture
+
+
+def test_the_picture_by_loops():
+    env = StarField(size=36, n_stars=120)  # so many that some overlap
+    for seed in range(2):
+        observation, info = env.reset(seed=seed)
+        expected = picture_by_loops(env, info["rotation"], info["translation"])
+        np.testing.assert_allclose(observation, 255 * expected, atol=0.51)
+
+
+def test_rotations_stay_rotations():
+    env = StarField()
+    env.reset(seed=0)
+    for action in np.random.default_rng(0).integers(0, 12, 100_000):
+        env._move(action)
+    np.testing.assert_allclose(env.rotation.T @ env.rotation, np.eye(3), rtol=0, atol=1e-14)
+    assert np.linalg.det(env.rotation) > 0 and ((0 <= env.translation) & (env.translation < 1)).all()
+    skewed = env.rotation + 1e-4 * np.random.default_rng(1).normal(size=(3, 3))
+    left, _, right = np.linalg.svd(skewed)  # the nearest rotation
+    np.testing.assert_allclose(orthonormalized(skewed), left @ right, atol=1e-6)
+
+
+def test_poses_are_uniform():
+    rng = np.random.default_rng(0)
+    rotations = np.array([quaternion_rotation(rng.standard_normal(4)) for _ in range(4000)])
+    np.testing.assert_allclose(np.linalg.det(rotations), 1)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (4000, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(rotations.mean(axis=0), np.zeros((3, 3)), atol=0.04)
+    np.testing.assert_allclose((rotations**2).mean(axis=0), np.full((3, 3), 1 / 3), atol=0.02)
+    # Of uniform rotations the angle has the density (1 − cos)/π: mean π/2 + 2/π.
+    angles = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    np.testing.assert_allclose(angles.mean(), pi / 2 + 2 / pi, atol=0.05)
+
+
+def test_layouts():
+    env, same, other = StarField(), StarField(), StarField(layout_seed=1)
+    assert (env.reset(seed=1)[0] == same.reset(seed=1)[0]).all()
+    assert (env.reset(seed=1)[0] != other.reset(seed=1)[0]).any()
+    still = StarField(translations=False)
+    _, info = still.reset(seed=3)
+    assert (info["translation"] == 0.5).all() and json.dumps(still.metadata)
+    mean = np.mean([env.reset(seed=seed)[0].max(axis=2) > 40 for seed in range(50)])
+    assert 0.03 < mean < 0.5  # enough to see, and something dark between
