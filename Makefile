@@ -7,7 +7,7 @@ CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
 
-.PHONY: demo test pytest slow format lint type commit-checks clean
+.PHONY: demo test pytest slow format lint type commit-checks doc clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -39,5 +39,8 @@ type: $(VENV)/installed
 
 commit-checks: format lint type
 
+doc: $(VENV)/installed
+	$(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,0 +1,365 @@
+"""
+README and docs/ say what is true: Python blocks run, command lines are understood, files fit, nothing escapes.
+
+Blocks are found by sybil; those of one page share a namespace, in the order of the page, in an empty folder. So that a
+page takes seconds, ``learn`` does 20 steps instead of what it is asked for and learns from the 16th on, at least every fourth
+step, by at most two updates; a PPO rollout has 8 steps, a game of Atari ends after 40 steps and an evaluation after one
+episode (see ``shortened``). Nothing else is replaced.
+"""
+
+import argparse
+import ast
+import importlib
+import json
+import os
+import pathlib
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+import warnings
+
+import huggingface_hub
+import huggingface_sb3
+import pytest
+import stable_baselines3.common.evaluation
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from sybil import Sybil
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
+
+import sb3_eqr.envs.atari
+import sb3_eqr.zoo.__main__ as zoo_command
+import sb3_eqr.zoo.hub
+from sb3_eqr import cli
+from sb3_eqr.benchmark.agents import find_agent
+from sb3_eqr.benchmark.suites import choose, load_suite, make_suite
+from sb3_eqr.zoo.entries import check_entry
+
+ROOT = pathlib.Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(set(DOCS.rglob("*.md")) - set((DOCS / "_build").rglob("*")))]
+STEPS, LEARNING_STARTS, TRAIN_FREQ, GRADIENT_STEPS, ROLLOUT, GAME_STEPS = 20, 16, 4, 2, 8, 40
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+# --- what a block may be -------------------------------------------------------------------------------------------------
+
+
+def check_sh(example):
+    for line in command_lines(example.parsed):
+        check_command(line)
+
+
+def check_yaml(example):
+    """An entry of hyperparameters has ``policy``, a suite has ``games``."""
+    for name, entry in yaml.safe_load(example.parsed).items():
+        if "games" in entry:
+            make_suite(name, "docs", entry)
+        else:
+            check_entry(entry, "eqr_rainbow" if "rainbow" in example.path else "eqr_qrdqn", "docs")
+
+
+def check_text(example):
+    """Output, folders, a drawing: read by people only."""
+
+
+def check_eval_rst(example):
+    """What autodoc is to show is there."""
+    for kind, name in re.findall(r"^\.\. auto(\w+):: (\S+)$", example.parsed, re.M):
+        module, _, attribute = name.rpartition(".")
+        if kind == "module":
+            importlib.import_module(name)
+        else:
+            assert getattr(importlib.import_module(module), attribute).__doc__, name
+
+
+def check_literalinclude(example):
+    """The file has what is shown of it."""
+    options = dict(re.findall(r"^:([\w-]+): *(.*)$", example.parsed, re.M))
+    text = (pathlib.Path(example.path).parent / argument(example)).read_text(encoding="utf-8")
+    node = ast.parse(text)
+    for part in filter(None, options.pop("pyobject", "").split(".")):
+        node = next(child for child in node.body if getattr(child, "name", None) == part)
+    for option in ("start-after", "start-at", "end-before", "end-at"):
+        assert options.pop(option, "") in text
+    assert options.keys() <= {"language", "dedent", "caption"}, options  # line numbers go stale
+
+
+def check_pages(example):
+    """Every page of a table of contents is there."""
+    folder = pathlib.Path(example.path).parent
+    for line in example.parsed.splitlines():
+        path = re.sub(r".* <(.*)>$", r"\1", line)  # Title <path>
+        assert not path or path.startswith(":") or (folder / f"{path}.md").is_file(), line
+
+
+def check_include(example):
+    assert (pathlib.Path(example.path).parent / argument(example)).is_file()
+
+
+def argument(example):
+    return example.region.lexemes["info"].split("}")[1].strip()
+
+
+BLOCKS = {
+    "python": PythonEvaluator(),
+    "sh": check_sh,
+    "yaml": check_yaml,
+    "text": check_text,
+    "": check_text,
+    "{eval-rst}": check_eval_rst,
+    "{literalinclude}": check_literalinclude,
+    "{toctree}": check_pages,
+    "{include}": check_include,
+}
+
+
+def every_fence(document):
+    """Sybil's parser: any block between fences, with the evaluator of its language or directive."""
+    for region in RawFencedCodeBlockLexer(re.compile(r"(?P<info>.*)$\n", re.M))(document):
+        language = (region.lexemes["info"].split() or [""])[0]
+        assert language in BLOCKS, f"{document.path}: no test knows what to do with a block of {language!r}"
+        region.parsed = region.lexemes["source"]
+        region.evaluator = BLOCKS[language]
+        yield region
+
+
+def examples_of(page):
+    return list(Sybil([every_fence]).parse(page).examples())
+
+
+def without_blocks(text):
+    return re.sub(r"^```.*?^```$", "", text, flags=re.S | re.M)
+
+
+# --- command lines -------------------------------------------------------------------------------------------------------
+
+
+class Understood(Exception):
+    """Raised where a command has parsed its arguments and would begin to work."""
+
+
+def command_lines(text):
+    """
+    :return: the words of each line, without comments and variables of the environment
+    """
+    for line in text.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        while words and re.match(r"[A-Z_]+=", words[0]):
+            del words[0]
+        if words:
+            yield words
+
+
+def check_command(words):
+    """Fail unless the program that the words call understands the others."""
+    program, arguments = words[0], words[1:]
+    if program == "pip":
+        check_pip(arguments)
+    elif program == "make":
+        check_make(arguments)
+    elif words[:3] == ["python", "-m", "sb3_eqr.zoo"]:
+        check_sb3_eqr(words[3:])
+    elif program == "sb3-eqr":
+        check_sb3_eqr(arguments)
+    elif words[:2] == ["python", "-m"]:
+        check_script(lambda: runpy.run_module(words[2], run_name="__main__"), words[3:])
+    elif program == "python":
+        assert pathlib.Path(words[1]).parent.name == "examples", words
+        check_script(lambda: runpy.run_path(str(ROOT / words[1]), run_name="__main__"), words[2:])
+    else:
+        raise AssertionError(f"{program}: no test knows this command")
+
+
+def check_pip(arguments):
+    assert arguments[0] == "install"
+    extras = re.search(r"\[project.optional-dependencies\]\n(.*?)\n\[", (ROOT / "pyproject.toml").read_text(), re.S)[1]
+    legal = re.findall(r"^([\w-]+) = \[", extras, re.M)
+    for word in arguments[1:]:
+        if match := re.match(r"(?:\.|sb3-eqr)\[(.*)\]$", word):
+            assert set(match[1].split(",")) <= set(legal), word
+        elif word.endswith(".txt"):
+            assert (ROOT / word).is_file(), word
+        else:
+            assert word in (".", "-c", "-e"), word
+
+
+def check_make(arguments):
+    makefile = (ROOT / "Makefile").read_text()
+    for word in arguments:
+        name, assigned, _ = word.partition("=")
+        assert re.search(rf"^{name} \?=" if assigned else rf"^{name}:", makefile, re.M), word
+
+
+def check_sb3_eqr(arguments):
+    args = check_script(cli.main, arguments)  # of RL Zoo's commands also names, files and hyperparameters
+    if arguments[:2] == ["benchmark", "run"] and args.suite is not None:
+        if args.suite_file is None:
+            choose(load_suite(args.suite), args.games, args.steps)
+        for agent in args.agents:
+            if not agent.endswith(".yml"):  # a file of the reader's
+                find_agent(agent)
+
+
+def check_script(call, arguments):
+    """
+    :param call: what runs it, to where its real parser has parsed
+    :return: what it has parsed
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        parse_args = argparse.ArgumentParser.parse_args
+
+        def parse_and_stop(self, args=None, namespace=None):
+            raise Understood(parse_args(self, args, namespace))
+
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
+        patch.setattr(zoo_command, "check_trained", lambda args: None)  # nothing is trained here
+        patch.setattr(zoo_command, "check_trained_agent", lambda path: None)
+        for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # replaced for good by a command
+            patch.setattr(module, name, getattr(module, name))
+        patch.setattr("huggingface_sb3.push_to_hub.generate_metadata", None, raising=False)
+        patch.setattr(sb3_eqr.zoo.hub, "provide_ffmpeg", lambda: None)
+        patch.setattr(zoo_command, "save_where_nothing_is_shown", lambda command: None)
+        patch.setattr(sys, "argv", ["command", *arguments])
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # runpy's, of modules that are imported already
+                call()
+        except Understood as understood:
+            return understood.args[0]
+        assert not arguments  # it takes none, and has done its work
+        return None
+
+
+# --- the tests -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shortened(monkeypatch, tmp_path):
+    """Training and evaluation of seconds; what the pages read is there."""
+    setup_learn, evaluate = BaseAlgorithm._setup_learn, stable_baselines3.common.evaluation.evaluate_policy
+
+    def setup_short_learn(self, total_timesteps, *args, **kwargs):
+        if isinstance(self, OffPolicyAlgorithm):
+            self.learning_starts = min(self.learning_starts, LEARNING_STARTS)
+            self.gradient_steps = min(self.gradient_steps, GRADIENT_STEPS)
+            self.train_freq = self.train_freq._replace(frequency=min(self.train_freq.frequency, TRAIN_FREQ))
+        return setup_learn(self, min(total_timesteps, STEPS), *args, **kwargs)
+
+    def set_up_short_rollouts(self):
+        self.n_steps, self.batch_size = ROLLOUT, ROLLOUT
+        setup_model(self)
+
+    def evaluate_one(model, env, n_eval_episodes=10, **kwargs):
+        return evaluate(model, env, n_eval_episodes=1, **kwargs)
+
+    setup_model = OnPolicyAlgorithm._setup_model
+    monkeypatch.setattr(BaseAlgorithm, "_setup_learn", setup_short_learn)
+    monkeypatch.setattr(OnPolicyAlgorithm, "_setup_model", set_up_short_rollouts)
+    monkeypatch.setattr(stable_baselines3.common.evaluation, "evaluate_policy", evaluate_one)
+    monkeypatch.setattr(sb3_eqr.envs.atari, "MAX_STEPS", GAME_STEPS)
+    monkeypatch.chdir(tmp_path)
+    write_a_benchmark(tmp_path / "results" / "smoke")
+
+
+def write_a_benchmark(folder):
+    """One finished run, as far as ``load_scores`` reads it."""
+    evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
+    training = {"step": [100], "score": [100.0], "length": [100]}
+    names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}
+    run = folder / "runs" / "eqr_qrdqn" / "CartPole-v1" / "0"
+    run.mkdir(parents=True)
+    (run / "result.json").write_text(json.dumps({**names, "evaluations": [evaluation], "training": training}))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_block(page, shortened):
+    for example in examples_of(page):
+        example.evaluate()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_no_block_escapes(page):
+    """Counted without sybil: as many blocks as pairs of fences, and none that is code by its indentation only."""
+    text = page.read_text(encoding="utf-8")
+    fences = re.findall(r"^\s*(?:[-*+>]\s*)*(?:```|~~~|:::)", text, re.M)
+    assert len(fences) == 2 * len(examples_of(page))
+    assert not re.findall(r"^\n {4,}\w.*$", without_blocks(text), re.M), "code without a fence"
+
+
+def test_commands_within_sentences_and_tables():
+    """`sb3-eqr train ...` in a line of text, where it is whole: no placeholders."""
+    text = "\n".join(without_blocks(page.read_text(encoding="utf-8")) for page in PAGES)
+    spans = re.findall(r"`((?:[A-Z_]+=\S+ )?(?:sb3-eqr [a-z]\w* -|python examples/|python -m |make |pip )[^`]*)`", text)
+    whole = [span for span in spans if not re.search(r"\.\.\.|\[FOLDER|\bCOMMAND\b|sb3_eqr\.zoo$", span)]
+    assert len(whole) > 10
+    for span in whole:
+        for words in command_lines(span):
+            check_command(words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    """Relative ones, on GitHub as in Sphinx: to a file, and to a heading of it."""
+    text = without_blocks(page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text):
+        path, _, anchor = target.partition("#")
+        found = page.parent / path if path else page
+        assert found.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", found.read_text(encoding="utf-8"), re.M)
+            assert anchor in [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings], target
+
+
+STORY = [  # lines of the pages, in an order that works, and what shortens them: of an argument given twice the last one counts
+    ("sb3-eqr train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 5000", "-n 400 --eval-freq 200 --eval-episodes 2"),
+    ("sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render", "-n 50"),
+    ("sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn qrdqn:stock --seeds 2", "--steps 300 --seeds 1"),
+    ("sb3-eqr benchmark status results/smoke", ""),
+    ("sb3-eqr benchmark report results/smoke", ""),
+    ("python examples/demo.py --game Boxing --config se2+aet --steps 100000", "--steps 30 --eval-episodes 1"),
+    ("python examples/cartpole.py --seeds 0 1 2 3 4", "--seeds 0 --steps 1100"),
+    (
+        "python examples/blind_cliffwalk.py --seeds 10 --json docs/results/cliffwalk.json",
+        "--seeds 1 --states 2 --json cliffwalk.json",
+    ),
+    ("python examples/random_play.py", "--episodes 2"),
+]
+
+
+@pytest.mark.slow
+def test_commands_really_run(tmp_path):
+    text = "\n".join(example.parsed for page in PAGES for example in examples_of(page) if example.region.evaluator is check_sh)
+    written = list(command_lines(text))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    for line, changes in STORY:
+        assert line.split() in written, f"no page has: {line}"
+        program, *arguments = [*line.split(), *changes.split()]
+        if program == "python":
+            command = [sys.executable, str(ROOT / arguments[0]), *arguments[1:]]
+        else:
+            command = [str(pathlib.Path(sys.executable).parent / program), *arguments]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{line} {changes}\n{done.stdout}\n{done.stderr}"
+    for path in (
+        "logs/eqr_qrdqn",
+        "results/smoke/report/report.html",
+        "demo_results/Boxing-se2+aet/training.png",
+        "cliffwalk.json",
+    ):
+        assert (tmp_path / path).exists(), path
+
+
+@pytest.mark.slow
+def test_the_pages_are_built_without_warnings(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", str(DOCS), str(tmp_path / "html")]
+    subprocess.run([*command, "-d", str(tmp_path / "doctrees")], check=True, timeout=300)
+    assert (tmp_path / "html" / "index.html").is_file()
