@@ -27,17 +27,21 @@ from sb3_eqr.visualize.latents import action_elements, coordinates, encode, spli
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-DEFAULT_ARM = "standardised, seamless"
-PAPER: dict[str, Any] = {"parameterization": "euler", "standardize": False}  # the example as the paper states it
+PAPER: dict[str, Any] = {"parameterization": "euler", "whiten": False, "aet_loss": "distance"}  # Example 2 as it is stated
+SEAMLESS = {"parameterization": "gram-schmidt"}
+WHITENED = {"whiten": True}
+CONTRASTIVE = {"aet_loss": "contrastive"}
+DEFAULT_ARM = "contrastive, whitened, seamless"
 ARMS: dict[str, dict[str, Any]] = {
     DEFAULT_ARM: {},
     "AET alone": PAPER,
-    "AET alone, seamless": {"standardize": False},
-    "AET alone, standardised": {"parameterization": "euler"},
-    "contrastive": {**PAPER, "aet_loss": "contrastive"},
-    "contrastive, seamless": {"standardize": False, "aet_loss": "contrastive"},
-    "contrastive, standardised, seamless": {"aet_loss": "contrastive"},
-    "actions depend on the state": {"state_dependent_actions": True},
+    "seamless": {**PAPER, **SEAMLESS},
+    "whitened": {**PAPER, **WHITENED},
+    "whitened, seamless": {**PAPER, **WHITENED, **SEAMLESS},
+    "contrastive": {**PAPER, **CONTRASTIVE},
+    "contrastive, seamless": {**PAPER, **CONTRASTIVE, **SEAMLESS},
+    "contrastive, whitened": {**PAPER, **CONTRASTIVE, **WHITENED},
+    "all, and actions that depend on the state": {"state_dependent_actions": True},
 }
 DIMENSIONS = {"ball": 1, "torus": 2}
 STEPS = {"ball": 2_000, "torus": 5_000}
@@ -145,8 +149,9 @@ def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) ->
         every = along[:: GRID["ball"] // 8]  # eight positions
         angles = 2 * np.pi * turns(model, encode(model, pictures(world, along)))
         eight = 2 * np.pi * turns(model, encode(model, pictures(world, every)))
-        panels[axis, 0].imshow(pictures(world, every).amax(dim=0)[0], cmap="gray")
-        panels[axis, 0].set_title("eight positions", fontsize="small")
+        shown = np.pad(pictures(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
+        panels[axis, 0].imshow(np.block([list(shown[:4]), list(shown[4:])]), cmap="gray")
+        panels[axis, 0].set_title("positions 0 to 3, 4 to 7", fontsize="small")
         panels[axis, 0].set_axis_off()
         for k in range(n_blocks):
             panel = panels[axis, k + 1]

@@ -1,6 +1,5 @@
 """Representation learning without reward: encoder and latent model alone, on random actions (Example 2 of the paper)."""
 
-import warnings
 from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -14,16 +13,16 @@ def train_representation(
     env: GymEnv | str,
     group: str | Group,
     n_blocks: int | None = 1,
-    total_timesteps: int = 3_000,
+    total_timesteps: int = 2_000,
     policy: str = "CnnPolicy",
     learning_rate: float | Schedule | None = None,
     learning_starts: int = 500,
     batch_size: int = 64,
     prediction_depth: int = 5,
-    aet_loss: str = "distance",
+    aet_loss: str = "contrastive",
     get_coef: float = 0.0,
     parameterization: str = "gram-schmidt",
-    standardize: bool = True,
+    whiten: bool = True,
     state_dependent_actions: bool = False,
     policy_kwargs: dict[str, Any] | None = None,
     callback: MaybeCallback = None,
@@ -55,10 +54,11 @@ def train_representation(
             "group": group,
             "n_blocks": n_blocks,
             "parameterization": parameterization,
-            "standardize": standardize,
+            "whiten": whiten,
             "state_dependent_actions": state_dependent_actions,
             "projection": "none",
             "noisy": False,
+            "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's own: Table 5's stops small gradients
             "dueling": False,
             **(policy_kwargs or {}),
         },

@@ -1,5 +1,7 @@
 """The one training loop of every EqR agent (Algorithm 1)."""
 
+import io
+import pathlib
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -13,7 +15,9 @@ from torch import nn
 from sb3_eqr.common.augmentations import ImageAugmentation
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.eqr_setup import EqRSetup
+from sb3_eqr.common.layers import Whitening
 from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
+from sb3_eqr.common.transfer import load_representation, representation
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
@@ -36,9 +40,11 @@ class EqRAlgorithm(EqRSetup):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        if self.representation_frozen:
+            self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         encoder_modules = self.policy.online.features_extractor.modules()
-        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd)
+        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
         self._target_is_copy = True  # it is built as one
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
@@ -248,6 +254,25 @@ class EqRAlgorithm(EqRSetup):
         """As SB3's ``set_parameters``, with the same parameters."""
         self._target_is_copy = False  # nothing is known of them
         super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def load_representation(
+        self: SelfEqRAlgorithm, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False
+    ) -> SelfEqRAlgorithm:
+        """
+        Start from the representation of another run: encoder, κ, ρ and b are taken from its file, the Q head and the reward
+        predictor stay this agent's own. The tasks must have the same observations and actions (paper, §4).
+
+        :param path: what ``save`` of either agent wrote, or of :func:`~sb3_eqr.representation.train_representation`
+        :param freeze: whether they stay as they are from now on; ``aet_coef=0, get_coef=0`` then saves their time
+        :return: this agent
+        :raises ValueError: if it does not fit: another group, trunk or number of actions; nothing is changed then
+        """
+        load_representation(self.policy, path)
+        self.representation_frozen = freeze
+        if freeze:
+            self.policy.freeze(list(representation(self.policy).values()))
+        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)  # no way back to before
+        return self
 
     def _before_saving(self) -> None:
         self._collect_metrics()  # a model whose last update went wrong is put back and not saved

@@ -196,6 +196,7 @@ class EqRArguments(SafeFiles):
         self.reset_interval = reset_interval
         self.reset_shrink_factor = reset_shrink_factor
         self.reset_fraction = reset_fraction
+        self.representation_frozen = False  # by load_representation; survives saving
         self._resets: list[int] = []  # the number of updates before each reset so far
         if _init_setup_model:
             self._setup_model()

@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
-from sb3_eqr.common.layers import NATURE_LAYERS, ConvTrunk, ImpalaTrunk, rescaled
+from sb3_eqr.common.layers import NATURE_LAYERS, ConvTrunk, ImpalaTrunk, Whitening, rescaled
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 DEFAULT_GROUP = "SE(2)"  # §7 and Table 5
@@ -146,8 +146,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param n_blocks: K ≥ 1; ``None``: 12, for T(n) 32 (Table 5), and 1 where the name counts its own blocks
         ("SE(2)^8 x SO(3)^4", "none")
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
-    :param standardize: whether what the trunk says of the algebra is brought to mean 0 and variance 1 over the batch (batch
-        norm without scale and offset), so that states cannot collapse to a point and spread around the identity
+    :param whiten: whether the algebra parameters are whitened over the batch (:class:`~sb3_eqr.common.layers.Whitening`), so
+        that states cannot collapse to a point, nor all blocks to the same
     :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
@@ -161,7 +161,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         group: str | Group = DEFAULT_GROUP,
         n_blocks: int | None = None,
         parameterization: str = "euler",
-        standardize: bool = False,
+        whiten: bool = False,
         trunk_class: str | type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
         normalized_image: bool = False,
@@ -183,8 +183,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         self.trunk = found(observation_space, **trunk_kwargs)
         n_params = n_blocks * made.num_params
         self.to_algebra: nn.Module = nn.Linear(self.trunk.features_dim, n_params)
-        if standardize:
-            self.to_algebra = nn.Sequential(self.to_algebra, nn.BatchNorm1d(n_params, affine=False))
+        if whiten:
+            self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """

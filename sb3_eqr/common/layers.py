@@ -128,6 +128,47 @@ class DistributionalHead(nn.Module):
         return th.cat([stream[0](features) for stream in streams], dim=-1)
 
 
+class Whitening(nn.Module):
+    """
+    Batch norm that looks at all features at once: mean 0, variance 1 and no correlation over the batch, by the Cholesky factor
+    of the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). Without scale and offset, so that a collapse
+    to a point, or of several features to one, is out of reach. A batch of B samples tells the covariance of D features only
+    so well: D / (D + B) of each correlation is not believed. In eval mode the statistics are running means.
+
+    :param n_features: D
+    :param momentum: of the running means, as in PyTorch's batch norm
+    """
+
+    running_mean: th.Tensor  # (D,)
+    running_covariance: th.Tensor  # (D, D)
+
+    def __init__(self, n_features: int, momentum: float = 0.1):
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("running_mean", th.zeros(n_features))
+        self.register_buffer("running_covariance", th.eye(n_features))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: (B, D); B ≥ 2 in train mode
+        :return: (B, D)
+        """
+        mean, covariance = self.running_mean, self.running_covariance
+        if self.training:
+            n, n_features = features.shape
+            mean = features.mean(dim=0)
+            centred = features - mean
+            variances = th.diag(centred.square().mean(dim=0))
+            covariance = th.lerp(centred.mT @ centred / n, variances, n_features / (n_features + n))
+            with th.no_grad():
+                self.running_mean.lerp_(mean, self.momentum)
+                self.running_covariance.lerp_(covariance, self.momentum)
+        eye = th.eye(len(covariance), dtype=covariance.dtype, device=covariance.device)
+        smallest = 1e-5 * covariance.diagonal().mean() + 1e-10  # relative: untrained features differ by very little
+        factor, _ = th.linalg.cholesky_ex(covariance + smallest * eye)
+        return th.linalg.solve_triangular(factor, (features - mean).mT, upper=False).mT
+
+
 NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and appendix B.4
 
 

@@ -55,8 +55,8 @@ class EqRPolicy(BasePolicy):
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
-    :param standardize: whether the encoder's algebra parameters are brought to mean 0 and variance 1 over the batch: states
-        cannot collapse to a point then
+    :param whiten: whether the encoder's algebra parameters are whitened over the batch: neither can states collapse to a point
+        then, nor all blocks to the same
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
@@ -95,7 +95,7 @@ class EqRPolicy(BasePolicy):
         group: str | Group | None = DEFAULT_GROUP,
         n_blocks: int | None = None,
         parameterization: str = "euler",
-        standardize: bool = False,
+        whiten: bool = False,
         dueling: bool = True,
         noisy: bool = True,
         sigma_init: float = 0.5,
@@ -122,7 +122,8 @@ class EqRPolicy(BasePolicy):
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
-        self.standardize = standardize
+        self.whiten = whiten
+        self._frozen: list[nn.Module] = []
         self.latent_hidden_dim = latent_hidden_dim
         self.dueling = dueling
         self.noisy = noisy
@@ -167,7 +168,7 @@ class EqRPolicy(BasePolicy):
             "group": self.group,
             "n_blocks": self.n_blocks,
             "parameterization": self.parameterization,
-            "standardize": self.standardize,
+            "whiten": self.whiten,
             "normalized_image": not self.normalize_images,
         }
         if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
@@ -292,6 +293,18 @@ class EqRPolicy(BasePolicy):
         """
         super().set_training_mode(mode)
         self.latent_model.train(mode)
+        for module in self._frozen:
+            module.eval()
+
+    def freeze(self, modules: list[nn.Module]) -> None:
+        """
+        Leave modules as they are from now on: parameters and batch statistics.
+
+        :param modules: parts of this policy
+        """
+        self._frozen = modules
+        for module in modules:
+            module.requires_grad_(False).eval()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -299,7 +312,7 @@ class EqRPolicy(BasePolicy):
             group=self.group,
             n_blocks=self.n_blocks,
             parameterization=self.parameterization,
-            standardize=self.standardize,
+            whiten=self.whiten,
             latent_hidden_dim=self.latent_hidden_dim,
             dueling=self.dueling,
             noisy=self.noisy,

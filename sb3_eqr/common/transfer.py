@@ -1,0 +1,64 @@
+"""The representation of one agent for another: tasks that differ in reward share their transitions' symmetries (paper, §4)."""
+
+import io
+import pathlib
+import re
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+from torch import nn
+
+from sb3_eqr.common.policies import EqRPolicy
+
+ENCODER = "features_extractor"
+LATENT_PARTS = ("transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
+
+
+def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+    """
+    Put encoder, κ, ρ and b of a saved agent into a policy and its target copy. If something does not fit, nothing is changed.
+
+    :param policy: of either agent
+    :param path: a file of either agent
+    :raises ValueError: if the file holds no EqR agent, or one of another group, trunk or number of actions
+    """
+    _, saved, _ = load_from_zip_file(path, device=policy.device)  # type: ignore[arg-type]
+    parameters: Any = (saved or {}).get("policy", {})
+    found: dict[str, dict[str, th.Tensor]] = {name: {} for name in (ENCODER, *LATENT_PARTS)}
+    for name, value in parameters.items():
+        match = re.fullmatch(rf"(?:(?!\w+_target\.)\w+\.{ENCODER}|latent_model\.(\w+))\.(.+)", name)
+        if match and (match[1] or ENCODER) in found:
+            found[match[1] or ENCODER][match[2]] = value
+    modules = representation(policy)
+    for name, module in modules.items():
+        expected = {key: _kind(value) for key, value in module.state_dict().items()}
+        given = {key: _kind(value) for key, value in found[name].items()}
+        for key in sorted(expected.keys() | given.keys()):
+            if expected.get(key) != given.get(key):
+                raise ValueError(
+                    f"load_representation: expected the encoder, group and actions of this agent; {name}.{key} is "
+                    f"{expected.get(key, 'missing')} here and {given.get(key, 'missing')} in the file. Build this agent with "
+                    "the policy_kwargs of that one (group, n_blocks, parameterization, whiten, trunk, latent_hidden_dim, "
+                    "state_dependent_actions), for the same observations and actions."
+                )
+    for name, module in modules.items():
+        module.load_state_dict(found[name])
+        for parameter in module.parameters():
+            policy.optimizer.state.pop(parameter, None)
+    policy.target.features_extractor.load_state_dict(found[ENCODER])
+    for name in LATENT_PARTS:
+        if hasattr(policy.latent_model_target, name):
+            getattr(policy.latent_model_target, name).load_state_dict(found[name])
+
+
+def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
+    """
+    :return: the encoder and the parts of the latent model that do not depend on rewards
+    """
+    return {ENCODER: policy.online.features_extractor} | {name: getattr(policy.latent_model, name) for name in LATENT_PARTS}
+
+
+def _kind(value: th.Tensor) -> str:
+    """The shape of parameters; the name of the group, which the encoder keeps as text."""
+    return bytes(value.tolist()).decode() if value.dtype == th.uint8 else f"of shape {tuple(value.shape)}"

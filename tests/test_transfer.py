@@ -1,0 +1,99 @@
+"""A representation that goes from one run to another."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.common.transfer import representation
+from tests.models import MAKERS
+from tests.toys import ChainEnv
+
+QRDQN, RAINBOW = MAKERS
+WHITENED = {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}
+
+
+def states(model):
+    """Copies of every part's parameters and statistics."""
+    return {name: {k: v.clone() for k, v in m.state_dict().items()} for name, m in representation(model.policy).items()}
+
+
+def same(one, other):
+    return all(th.equal(one[name][key], other[name][key]) for name in one for key in one[name])
+
+
+@pytest.mark.parametrize("giver, taker", [(QRDQN, RAINBOW), (RAINBOW, QRDQN), (QRDQN, QRDQN)])
+def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, taker):
+    old = giver(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60)
+    old.save(tmp_path / "old")
+    new = taker(ChainEnv(), policy_kwargs=WHITENED).learn(60)
+    head = {k: v.clone() for k, v in new.policy.online.head.state_dict().items()}
+    rewards = [p.clone() for p in new.policy.latent_model.reward_net.parameters()]
+    assert not same(states(old), states(new))
+    assert new.load_representation(tmp_path / "old") is new
+    assert same(states(old), states(new))
+    assert all(th.equal(v, head[k]) for k, v in new.policy.online.head.state_dict().items())
+    assert all(th.equal(p, q) for p, q in zip(new.policy.latent_model.reward_net.parameters(), rewards, strict=True))
+    target, online = new.policy.latent_model_target, new.policy.latent_model
+    assert th.equal(target.transition[0].weight, online.transition[0].weight)
+    assert th.equal(
+        new.policy.target.features_extractor.to_algebra[0].weight, old.policy.online.features_extractor.to_algebra[0].weight
+    )
+    assert not any(p in new.policy.optimizer.state for m in representation(new.policy).values() for p in m.parameters())
+    before = states(new)
+    new.learn(30, reset_num_timesteps=False)
+    assert not same(before, states(new))  # it trains on
+
+
+def test_what_is_frozen_stays_through_training_saving_and_resets(make, tmp_path):
+    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60).save(tmp_path / "old")
+    model = make(ChainEnv(), policy_kwargs=WHITENED, reset_interval=30).load_representation(tmp_path / "old", freeze=True)
+    before, head = states(model), model.policy.online.head.advantage[0].weight.clone()
+    model.learn(60)
+    assert same(before, states(model)) and not th.equal(head, model.policy.online.head.advantage[0].weight)
+    model.save(tmp_path / "new")
+    loaded = make.algorithm.load(tmp_path / "new", env=ChainEnv())
+    loaded.learn(60)
+    assert same(before, states(loaded)) and loaded._resets  # a reset leaves it, too
+    assert not th.equal(head, loaded.policy.online.head.advantage[0].weight)
+
+
+@pytest.mark.parametrize(
+    "changes, found",
+    [
+        ({"n_blocks": 4}, "SE\\(2\\)\\^4, euler here"),
+        ({"group": "T(9)", "n_blocks": 1}, "features_extractor"),
+        ({"latent_hidden_dim": 8}, "transition"),
+        ({"state_dependent_actions": False}, "transition"),
+        ({"parameterization": "exp"}, "SE\\(2\\)\\^3, exp here and SE\\(2\\)\\^3, euler in the file"),
+        ({"whiten": True}, "missing"),
+    ],
+)
+def test_what_does_not_fit_changes_nothing(tmp_path, changes, found):
+    QRDQN(ChainEnv(), seed=1).save(tmp_path / "old")
+    model = QRDQN(ChainEnv(), policy_kwargs=changes)
+    before = states(model)
+    with pytest.raises(ValueError, match=f"load_representation: expected.*{found}"):
+        model.load_representation(tmp_path / "old")
+    assert same(before, states(model))
+
+
+def test_another_kind_of_file(tmp_path):
+    from sb3_contrib import QRDQN as Stock
+
+    Stock("MlpPolicy", ChainEnv(), device="cpu").save(tmp_path / "stock")
+    with pytest.raises(ValueError, match="load_representation: expected"):
+        QRDQN(ChainEnv()).load_representation(tmp_path / "stock")
+    for algorithm in (EqRQRDQN, EqRRainbow):
+        with pytest.raises(FileNotFoundError):
+            algorithm("MlpPolicy", ChainEnv(), device="cpu").load_representation(tmp_path / "nothing")
+
+
+def test_a_representation_helps_its_own_task(tmp_path):
+    """The states of another agent are the same, to the bit, wherever they are computed."""
+    old = QRDQN(ChainEnv(), seed=1).learn(60)
+    old.save(tmp_path / "old")
+    new = RAINBOW(ChainEnv(), seed=5).load_representation(tmp_path / "old")
+    observations = th.as_tensor(np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32))
+    for part in ("online", "target"):
+        assert th.equal(old.policy.online.features(observations), getattr(new.policy, part).features(observations))
