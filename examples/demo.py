@@ -1,12 +1,13 @@
 """
-An EqR agent on one Atari game, from training to a picture.
+An EqR agent on one Atari game, from training to a picture and a video of what it sees and predicts.
 
     python examples/demo.py --game Pong                       # EqRQRDQN, as many steps as fit into --minutes
     python examples/demo.py --game Boxing --steps 100000      # the real thing
     python examples/demo.py --config eqr_rainbow --steps 3000
     python examples/demo.py --config eqr_bbf --width-scale 1 --steps 3000    # narrow enough for two cores
 
-Leaves model.zip, progress.csv and training.png in --out.
+Leaves model.zip, progress.csv, training.png, latents.mp4 and latents.gif in --out. The video has the game at the left and the
+blocks of the agent's latent state at the right: now, and as its latent model predicted them five steps before.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.envs.atari import atari_env_id
+from sb3_eqr.visualize.animation import record
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -37,6 +39,9 @@ LOSSES = {
     "train/reward_loss": "reward loss",
 }
 EVALUATION_SECONDS = 60  # kept free at the end of the minutes
+ANIMATION_SECONDS = 15  # as well
+ANIMATION_STEPS = 200
+RESULTS = ("training.png", "latents.mp4", "latents.gif")
 CHECKPOINT_STEPS = 10_000
 FULL_STEPS = 100_000  # what the configurations are for
 SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Table 5's 2,000 would be most of it
@@ -130,8 +135,25 @@ def draw(
     beside.replace(path)
 
 
+def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, float]], out: pathlib.Path) -> None:
+    """
+    Evaluate, draw, film.
+
+    :param scores: of the games in training, (step, raw score)
+    """
+    env = make_atari100k_env(args.game, n_envs=args.eval_episodes, seed=args.seed + 10_000, training=False)
+    found, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
+    print(f"score of {len(found)} games after {model.num_timesteps} steps: mean {np.mean(found):.1f}, each {found}")
+    title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
+    progress = pd.read_csv(out / "progress.csv")
+    draw(progress, scores, float(np.mean(found)), model.learning_starts, title, out / "training.png")
+    env = make_atari100k_env(args.game, training=False)
+    # As it explores: without noise a young agent holds one button down.
+    record(model, env, out / "latents", ANIMATION_STEPS, seed=args.seed + 20_000, deterministic=False)
+
+
 def main() -> None:
-    """Train, evaluate, save, draw."""
+    """Train, save, evaluate, draw, film."""
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
@@ -141,11 +163,14 @@ def main() -> None:
         "--width-scale", type=float, help="of eqr_bbf, whose head gets 512 times as wide; 4 in its paper, 1 fits two cores"
     )
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
-    parser.add_argument("--minutes", type=float, default=5.5, help="for training and evaluation, where --steps is not given")
+    parser.add_argument("--minutes", type=float, default=5.5, help="for everything, where --steps is not given")
     parser.add_argument("--eval-episodes", type=int, default=3, help="games at the end")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument(
-        "--out", type=pathlib.Path, help="folder; demo_results/<game> or demo_results/<game>-<config> if not given"
+        "--out",
+        type=pathlib.Path,
+        help="folder for model.zip, progress.csv, training.png, latents.mp4 and latents.gif; demo_results/<game> or "
+        "demo_results/<game>-<config> if not given",
     )
     args = parser.parse_args()
     if args.width_scale is not None and args.config != "eqr_bbf":
@@ -155,7 +180,7 @@ def main() -> None:
     settings: dict = {}
     seconds, start = None, time.monotonic()
     if args.steps is None:
-        seconds = args.minutes * 60 - EVALUATION_SECONDS
+        seconds = args.minutes * 60 - EVALUATION_SECONDS - ANIMATION_SECONDS
         args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}
     elif "exploration_fraction" in (config := load_configuration(args.config)):
@@ -168,7 +193,8 @@ def main() -> None:
     callbacks: list[BaseCallback] = [demo]
     if args.steps > CHECKPOINT_STEPS:
         callbacks.append(CheckpointCallback(CHECKPOINT_STEPS, str(out / "checkpoints"), save_replay_buffer=True))
-    (out / "training.png").unlink(missing_ok=True)  # of a run before
+    for name in RESULTS:  # of a run before
+        (out / name).unlink(missing_ok=True)
     model.learn(args.steps, callback=callbacks, progress_bar=True)
     if model._n_updates == 0:
         print("No update was made: this configuration is too slow here. Try --width-scale 1 with eqr_bbf, or more --minutes.")
@@ -176,13 +202,9 @@ def main() -> None:
     model.logger.close()
     model.save(out / "model")
 
-    env = make_atari100k_env(args.game, n_envs=args.eval_episodes, seed=args.seed + 10_000, training=False)
-    scores, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
-    print(f"score of {len(scores)} games after {model.num_timesteps} steps: mean {np.mean(scores):.1f}, each {scores}")
-    title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
-    progress = pd.read_csv(out / "progress.csv")
-    draw(progress, demo.scores, float(np.mean(scores)), model.learning_starts, title, out / "training.png")
-    print(f"{out}/model.zip, {out}/progress.csv, {out}/training.png; {(time.monotonic() - start) / 60:.1f} minutes")
+    show(model, args, demo.scores, out)
+    files = ", ".join(f"{out}/{name}" for name in ("model.zip", "progress.csv", *RESULTS))
+    print(f"{files}; {(time.monotonic() - start) / 60:.1f} minutes")
 
 
 if __name__ == "__main__":

@@ -16,11 +16,12 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from torch.nn.functional import one_hot
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.safe_files import atomic_write
-from sb3_eqr.envs import SlidingBall
+from sb3_eqr.envs import SlidingBall, register
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split
 
@@ -43,10 +44,12 @@ ARMS: dict[str, dict[str, Any]] = {
     "contrastive, whitened": {**PAPER, **CONTRASTIVE, **WHITENED},
     "all, and actions that depend on the state": {"state_dependent_actions": True},
 }
+IDS = {"ball": "SlidingBall-v0", "torus": "SlidingBallTorus-v0"}
 DIMENSIONS = {"ball": 1, "torus": 2}
 STEPS = {"ball": 2_000, "torus": 5_000}
 GRID = {"ball": 192, "torus": 48}  # positions per axis that the learned map is looked at
 STEPS_AHEAD = 20
+N_ENVS = 16  # at once: random play of one alone sees little of a torus
 WIDTH = 0.25  # of the ball, in loops
 
 
@@ -171,7 +174,8 @@ def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) ->
 def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[str, Any]:
     """Train, save, measure, draw."""
     world = SlidingBall(dimensions=DIMENSIONS[world_name])
-    model = train_representation(world, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, **ARMS[arm])
+    env = make_vec_env(IDS[world_name], N_ENVS, seed)
+    model = train_representation(env, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, **ARMS[arm])
     name = f"{world_name}-{arm}-{seed}".replace(", ", "-").replace(" ", "_")
     model.save(out / name)
     result = {"world": world_name, "arm": arm, "seed": seed, "steps": steps, **measure(model, world, GRID[world_name])}
@@ -190,6 +194,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of random play; without it, 2000 for the ball, 5000 for the torus")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="folder")
     args = parser.parse_args()
+    register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"
     steps = args.steps or STEPS[args.world]

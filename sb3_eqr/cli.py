@@ -1,17 +1,19 @@
 """The console script ``sb3-eqr``."""
 
+import importlib
 import sys
+
+# Commands of this package, and RL Zoo's; each is also the extra that it needs.
+COMMANDS = ("benchmark", "visualize")
 
 
 def main() -> None:
     """Run the command line, or tell what to install for it."""
-    extra = "benchmark" if sys.argv[1:2] == ["benchmark"] else "zoo"
+    extra = sys.argv[1] if sys.argv[1:2] and sys.argv[1] in COMMANDS else "zoo"
     try:
-        if extra == "benchmark":
+        if extra in COMMANDS:
             del sys.argv[1]
-            from sb3_eqr.benchmark.__main__ import main as run
-        else:
-            from sb3_eqr.zoo.__main__ import main as run
+        run = importlib.import_module(f"sb3_eqr.{extra}.__main__").main
     except ImportError as error:
         advice = "" if "pip install" in str(error) else f'. pip install "sb3-eqr[{extra}]" brings it'
         sys.exit(f"sb3-eqr: {error}{advice}")

@@ -1,1 +1,23 @@
-"""Seeing what an agent has learned: diagnostics, pictures, animations. Needs ``pip install sb3-eqr[visualize]``."""
+"""
+Seeing what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes numbers and pictures (docs/visualize.md), ``diagnose``
+gives the numbers, ``LatentCallback`` logs them in training, ``record`` films it. Needs ``pip install sb3-eqr[visualize]``.
+"""
+
+import importlib
+from typing import Any
+
+__all__ = ["Diagnostics", "LatentCallback", "diagnose", "play", "record"]
+
+_MODULES = {
+    "Diagnostics": "diagnostics",
+    "LatentCallback": "callback",
+    "diagnose": "diagnostics",
+    "play": "latents",
+    "record": "animation",
+}
+
+
+def __getattr__(name: str) -> Any:  # later: the numbers need neither matplotlib nor imageio
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

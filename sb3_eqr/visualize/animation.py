@@ -2,7 +2,7 @@
 
 import pathlib
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, BinaryIO, NamedTuple
 
@@ -10,19 +10,21 @@ import numpy as np
 import torch as th
 from PIL import Image
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.safe_files import atomic_write, get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.visualize.canvas import Line, Painter
+from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
 from sb3_eqr.visualize.latents import action_elements, encode
+from sb3_eqr.visualize.loading import action_names
 from sb3_eqr.visualize.pixels import observed_pictures
 from sb3_eqr.visualize.sketches import panels
 
 MAX_PANELS = 36
+MAX_LETTERS = 45  # of the group's name
 FPS = 15  # Atari's 60 frames a second, of which an agent sees every fourth
 FORMATS = ("mp4", "gif")
 GIF_COLOURS = 64
@@ -55,8 +57,8 @@ def record(
     A video of the agent playing: left the game, right one panel per block of its latent state. What turns is an arrow, what
     shifts a dot with a trail; of a general matrix, the images of the unit vectors; in three dimensions, the three axes
     (red, green, blue); without a group, the first two principal components. In orange, or pale, what the latent model
-    predicted for this moment ``depth`` steps before, from the state of then and the actions since. Above, the action that
-    the agent chooses in this picture, its reward, and the score with it.
+    predicted for this moment ``depth`` steps before, from the state of then and the actions since; a triangle at an edge
+    where that lies beyond it. Above, the action that the agent chooses in this picture, its reward, and the score with it.
 
     All random generators are left as they were; the same seed draws the same frames.
 
@@ -86,12 +88,8 @@ def record(
         film = shoot(model, env, n_steps, seed, deterministic)
     states = encode(model, film.observations)  # (T, D)
     ghosts = predictions(model, states, film.actions, film.starts, depth)
-    latent_model = model.policy.latent_model
-    group, n_blocks = latent_model.group, latent_model.n_blocks
-    about = "no group" if isinstance(group, NoGroup) else f"{n_blocks} block{'s' if n_blocks > 1 else ''} of {group}"
     shown = panels(model, states, ghosts, MAX_PANELS)
-    about += f", the first {MAX_PANELS} panels" if len(shown) == MAX_PANELS else ""
-    painter = Painter(shown, film.starts, depth, f"{type(model).__name__}, {about}")
+    painter = Painter(shown, film.starts, depth, describe(model, len(shown)))
     return write_video(frames(film, painter), pathlib.Path(path), formats, fps)
 
 
@@ -134,8 +132,9 @@ def shoot(model: EqRAlgorithm, env: GymEnv, n_steps: int, seed: int, determinist
     seen = _first_envs(observations)
     if not renders:
         pictures = observed_pictures(seen, model.observation_space, model.frame_stack)
+    names = [f"action {name}" if name.isdigit() else name for name in action_names(env, int(model.policy.action_space.n))]
     tensors = {key: th.as_tensor(x) for key, x in seen.items()} if isinstance(seen, dict) else th.as_tensor(seen)
-    return Film(tensors, pictures, np.array(actions), np.array(rewards), np.array(starts), _action_names(model, env))
+    return Film(tensors, pictures, np.array(actions), np.array(rewards), np.array(starts), names)
 
 
 def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
@@ -159,11 +158,22 @@ def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, sta
     return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])
 
 
+def describe(model: EqRAlgorithm, n_shown: int) -> str:
+    """
+    :param n_shown: how many panels there are
+    :return: what the agent is, in one line
+    """
+    group, n_blocks = model.policy.latent_model.group, model.policy.latent_model.n_blocks
+    blocks = "no group" if isinstance(group, NoGroup) else f"{group}" if n_blocks == 1 else f"{n_blocks} blocks of {group}"
+    blocks = blocks if len(blocks) < MAX_LETTERS else f"{blocks[:MAX_LETTERS]}..."
+    return f"{type(model).__name__}, {blocks}{f', the first {MAX_PANELS}' if n_shown == MAX_PANELS else ''}"
+
+
 def frames(film: Film, painter: Painter) -> Iterator[np.ndarray]:
     """
     :param film: T steps
     :param painter: of their latents
-    :return: T of (height, width, 3), uint8
+    :return: T of (HEIGHT, WIDTH, 3), uint8
     """
     score = 0.0
     for t, (action, reward, start) in enumerate(zip(film.actions, film.rewards, film.starts, strict=True)):
@@ -173,42 +183,41 @@ def frames(film: Film, painter: Painter) -> Iterator[np.ndarray]:
 
 def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Sequence[str], fps: float) -> list[pathlib.Path]:
     """
-    :param images: (height, width, 3), uint8, of even size
+    :param images: (HEIGHT, WIDTH, 3), uint8
     :param path: without suffix
     :param formats: of :data:`FORMATS`
     :param fps: frames per second
     :return: the files
     """
-    if "mp4" in formats:
-        try:
-            import imageio.v2 as imageio
-            import imageio_ffmpeg  # noqa: F401
-        except ImportError as error:
-            raise ImportError('MP4 needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
     paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
     with ExitStack() as stack:
         files = {suffix: stack.enter_context(atomic_write(p, suffix)) for suffix, p in zip(formats, paths, strict=True)}
         movie = None
         if "mp4" in formats:
-            movie = imageio.get_writer(
-                files["mp4"].name,
-                format="FFMPEG",  # type: ignore[arg-type]
-                fps=fps,
-                codec="libx264",
-                pixelformat="yuv420p",
-                macro_block_size=2,
-                output_params=["-f", "mp4"],  # the name of the partial file does not tell
-            )
-            stack.callback(movie.close)
+            movie = _open_movie(files["mp4"].name, fps)
+            stack.callback(movie.close)  # before the file takes its place
         kept = []
         for t, image in enumerate(images):
             if movie is not None:
-                movie.append_data(image)
+                movie.send(np.ascontiguousarray(image))
             if "gif" in formats and t % GIF_INTERVAL == 0:
                 kept.append(Image.fromarray(image))
         if kept:
             _write_gif(kept, files["gif"], fps / GIF_INTERVAL)
     return paths
+
+
+def _open_movie(path: str, fps: float) -> Generator[None, np.ndarray | None, None]:
+    try:
+        from imageio_ffmpeg import write_frames  # what imageio writes with, for a file of any name
+    except ImportError as error:
+        raise ImportError('MP4 needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
+    size = (WIDTH, HEIGHT)
+    movie = write_frames(
+        path, size, fps=fps, pix_fmt_out="yuv420p", macro_block_size=2, quality=8, output_params=["-f", "mp4"]
+    )
+    movie.send(None)  # starts
+    return movie
 
 
 def _write_gif(images: list[Image.Image], file: BinaryIO, fps: float) -> None:
@@ -230,15 +239,6 @@ def _first_envs(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([obs[key][0] for obs in observations]) for key in observations[0]}
     return np.stack([obs[0] for obs in observations])
-
-
-def _action_names(model: EqRAlgorithm, env: VecEnv) -> list[str]:
-    n_actions = int(model.policy.action_space.n)
-    if env.has_attr("get_action_meanings"):  # Atari's own
-        names = env.env_method("get_action_meanings", indices=[0])[0]
-        if len(names) == n_actions:
-            return [str(name) for name in names]
-    return [f"action {i}" for i in range(n_actions)]
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sb3_eqr.visualize.sketches import Panel, Shape
+from sb3_eqr.visualize.sketches import ROOM, Panel, Shape
 
 WIDTH, HEIGHT = 900, 500  # even: H.264 asks for it
 TITLE, FOOTER, LEFT, GAP = 34, 28, 356, 6
@@ -95,8 +95,10 @@ class Painter:
         y = HEIGHT - FOOTER // 2
         draw.text((12, y), about, FAINT, font(12), anchor="lm")
         ghost = "1 step before" if depth == 1 else f"{depth} steps before"
-        draw.text((WIDTH - 12, y), f"predicted {ghost}", FAINT, font(12), anchor="rm")
-        x = WIDTH - 12 - round(font(12).getlength(f"predicted {ghost}")) - 14
+        beyond = any(p.ghost.dots is not None and (np.abs(p.ghost.dots) > 1).any() for p in self.panels)
+        legend = f"predicted {ghost}{' (at an edge: beyond it)' if beyond else ''}"
+        draw.text((WIDTH - 12, y), legend, FAINT, font(12), anchor="rm")
+        x = WIDTH - 12 - round(font(12).getlength(legend)) - 14
         draw.text((x - 58, y), "now", FAINT, font(12), anchor="lm")
         page.paste(_symbol(ghost=False), (x - 80, y - 10))
         page.paste(_symbol(ghost=True), (x - 10, y - 10))
@@ -110,6 +112,9 @@ class Painter:
         if panel.truth.dots is None:
             draw.line([(0, side // 2), (side, side // 2)], LINE, SMOOTH)
             draw.line([(side // 2, 0), (side // 2, side)], LINE, SMOOTH)
+        if panel.kind == "arrow" and panel.truth.dots is None:  # where its tip may be
+            edge = (1 - ROOM) / 2 * side
+            draw.ellipse([edge, edge, side - edge, side - edge], outline=LINE, width=SMOOTH)
         draw.rectangle([0, 0, side - 1, side - 1], outline=LINE, width=SMOOTH)
         size = SMOOTH * (11 if self.side > 90 else 9)
         draw.text((4 * SMOOTH, 3 * SMOOTH), panel.name, FAINT, font(size))
@@ -134,11 +139,13 @@ class Pen:
 
     :param draw: where
     :param side: of the panel, in pixels
+    :param least: how small its lines get in a small panel
     """
 
-    def __init__(self, draw: ImageDraw.ImageDraw, side: int):
+    def __init__(self, draw: ImageDraw.ImageDraw, side: int, least: float = 0.7):
         self.draw = draw
         self.side = side
+        self.unit = SMOOTH * min(max(side / SMOOTH / 140, least), 1.8)  # a pixel, larger in a large panel
 
     def at(self, point: np.ndarray) -> tuple[float, float]:
         """Pixels of a point in the panel's units; far outside is outside."""
@@ -147,7 +154,7 @@ class Pen:
 
     def arrow(self, start: np.ndarray, end: np.ndarray, colour: Colour, width: float) -> None:
         """
-        :param width: of the shaft, in pixels of the finished frame
+        :param width: of the shaft, in units of the pen
         """
         a, b = np.array(self.at(start)), np.array(self.at(end))
         length = float(np.linalg.norm(b - a))
@@ -155,23 +162,34 @@ class Pen:
             return
         along = (b - a) / length
         across = np.array([-along[1], along[0]])
-        head = min((2.2 * width + 3) * SMOOTH, length)
+        head = min((2.2 * width + 3) * self.unit, length)
         neck = b - head * along
-        self.draw.line([tuple(a), tuple(neck)], colour, round(width * SMOOTH))
+        self.draw.line([tuple(a), tuple(neck)], colour, round(width * self.unit))
         self.draw.polygon([tuple(b), tuple(neck + head / 2 * across), tuple(neck - head / 2 * across)], colour)
 
     def disc(self, centre: tuple[float, float], colour: Colour, radius: float) -> None:
         """
         :param centre: in pixels of the panel
-        :param radius: in pixels of the finished frame
+        :param radius: in units of the pen
         """
-        (x, y), r = centre, radius * SMOOTH
+        (x, y), r = centre, radius * self.unit
         self.draw.ellipse([x - r, y - r, x + r, y + r], colour)
 
     def ring(self, centre: tuple[float, float], colour: Colour, radius: float) -> None:
         """As :meth:`disc`, hollow."""
-        (x, y), r = centre, radius * SMOOTH
-        self.draw.ellipse([x - r, y - r, x + r, y + r], outline=colour, width=2 * SMOOTH)
+        (x, y), r = centre, radius * self.unit
+        self.draw.ellipse([x - r, y - r, x + r, y + r], outline=colour, width=round(2 * self.unit))
+
+    def mark_beyond(self, point: np.ndarray, colour: Colour) -> None:
+        """
+        A triangle at the edge that a point lies beyond.
+
+        :param point: in the panel's units
+        """
+        tip = point / np.abs(point).max() * (1 - 2 * SMOOTH / self.side)
+        along = tip / np.linalg.norm(tip) * 14 * SMOOTH / self.side
+        across = np.array([-along[1], along[0]]) / 1.5
+        self.draw.polygon([self.at(p) for p in (tip, tip - along + across, tip - along - across)], colour)
 
     def trail(self, points: np.ndarray) -> None:
         """
@@ -180,13 +198,13 @@ class Pen:
         for age, (a, b) in enumerate(zip(points[-2::-1], points[:0:-1], strict=True)):
             fade = 0.25 + 0.65 * age / TRAIL
             colour = tuple(round(fade * paper + (1 - fade) * blue) for paper, blue in zip(PANEL, BLUE, strict=True))
-            self.draw.line([self.at(a), self.at(b)], colour, round(1.5 * SMOOTH))
+            self.draw.line([self.at(a), self.at(b)], colour, round(1.5 * self.unit))
 
 
 def _symbol(ghost: bool) -> Image.Image:
     """For the legend."""
     image = Image.new("RGB", (20 * SMOOTH, 20 * SMOOTH), PAPER)
-    pen = Pen(ImageDraw.Draw(image), image.width)
+    pen = Pen(ImageDraw.Draw(image), image.width, least=1.0)
     _paint_shape(pen, Shape(None, np.zeros((1, 2))), "dot", 0, ghost)
     return image.reduce(SMOOTH)
 
@@ -198,11 +216,14 @@ def _paint_shape(pen: Pen, shape: Shape, kind: str, t: int, ghost: bool) -> None
         return
     foot = np.zeros(2) if dots is None else dots
     colour = GHOST if ghost else BLUE
+    if np.abs(foot).max() > 1:
+        pen.mark_beyond(foot, colour)
+        return
     if arrows is not None:
         tips = foot + arrows  # (A, 2)
         if kind == "parallelogram":
             corners = [pen.at(p) for p in (foot, tips[0], tips.sum(axis=0) - foot, tips[1], foot)]
-            pen.draw.line(corners, colour, round((3 if ghost else 1.5) * SMOOTH), joint="curve")
+            pen.draw.line(corners, colour, round((3 if ghost else 1.5) * pen.unit), joint="curve")
         colours = (GHOST_AXES if ghost else AXES) if kind == "axes" else (colour, colour)
         for i, tip in enumerate(tips):
             pen.arrow(foot, tip, colours[i], (5 if ghost else 2) - (0.5 if kind == "parallelogram" else 0))
@@ -215,12 +236,12 @@ def _side(area: tuple[int, int], columns: int, n: int) -> int:
 
 
 def _fitted(picture: np.ndarray) -> tuple[Image.Image, tuple[int, int]]:
-    """The game's picture as large as fits, by a whole factor where it grows; and its corner."""
+    """The game's picture as large as fits, small ones by a whole factor with hard edges; and its corner."""
     image = Image.fromarray(picture)
     room = LEFT - 2 * GAP, HEIGHT - TITLE - FOOTER
     factor = min(room[0] / image.width, room[1] / image.height)
-    sharp = factor >= 1
-    factor = int(factor) if sharp else factor
+    hard = factor >= 3
+    factor = int(factor) if hard else factor
     size = max(round(image.width * factor), 1), max(round(image.height * factor), 1)
-    image = image.resize(size, Image.Resampling.NEAREST if sharp else Image.Resampling.LANCZOS)
+    image = image.resize(size, Image.Resampling.NEAREST if hard else Image.Resampling.LANCZOS)
     return image, (GAP + (room[0] - size[0]) // 2, TITLE + (room[1] - size[1]) // 2)

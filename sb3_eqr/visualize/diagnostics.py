@@ -20,7 +20,7 @@ from sb3_eqr.visualize.findings import (
     find_generators,
     find_motion,
 )
-from sb3_eqr.visualize.latents import Play, _eval_mode, action_elements, latents, split
+from sb3_eqr.visualize.latents import Play, _eval_mode, action_elements, latents
 from sb3_eqr.visualize.measures import Rewards, Transition
 
 MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
@@ -47,9 +47,9 @@ class Diagnostics(NamedTuple):
         """One line for humans."""
         skill, gain = skill_and_gain(self.loss)
         return (
-            f"{self.verdict}: {_share(skill)} of the way from knowing nothing to exact, {_share(gain)} from standing still, "
-            f"{len(self.loss.error)} steps ahead; effective rank {self.collapse.effective_rank:.1f} of "
-            f"{self.collapse.dimensions}; {self.collapse.dead_units:.0%} of the trunk's units dead."
+            f"{self.verdict}: over {len(self.loss.error)} steps the rollout removes {_share(skill)} of the error of knowing "
+            f"nothing and {_share(gain)} of that of standing still; effective rank {self.collapse.effective_rank:.1f} of "
+            f"{self.collapse.dimensions}; {self.collapse.dead_units:.0%} of the trunk's units dead"
         )
 
 
@@ -64,19 +64,17 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     data = latents(model, play.samples)
     project = model.policy.project
     with th.no_grad(), _eval_mode(model):
-        projected = [F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)]
+        start, following, predicted = (
+            F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)
+        )
     chosen = th.linspace(0, len(data.states) - 1, min(len(data.states), MAX_STATES)).long().to(data.states.device)
     elements = action_elements(model, data.states[chosen])  # (n, A, K, ...)
     motion = find_motion(model, data, data.states[chosen], elements)
     generators = find_generators(model, elements)
-    loss = measures.transition_error(*projected, data.mask)
+    loss = measures.transition_error(start, following, predicted, data.mask)
     signed = model.policy.latent_model.reward_net[-1].out_features == 3
     return Diagnostics(
-        blocks=[
-            f"{group} {i}"
-            for group, found in split(model, data.states)
-            for i in range(found.shape[-1 - len(group.element_shape)])
-        ],
+        blocks=[f"{part.group} {i}" for part in generators for i in range(part.mean.shape[1])],
         transition=measures.transition_error(data.states, data.next_states, data.predicted, data.mask),
         loss=loss,
         motion=motion,
@@ -91,7 +89,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
 
 def find_verdict(loss: Transition) -> str:
     """
-    - "predicts": the rollout explains a quarter of what knowing nothing leaves open, and a quarter of what standing still does.
+    - "predicts": the rollout explains a quarter of what knowing nothing leaves open, and of what standing still does.
       An untrained agent whose states differ may do the first, for its κ moves them little, but not the second.
     - "collapsed": else, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are one, and κ
       leaves it where it is. In an untrained agent the states may be nearly one, but κ moves them away from it.
@@ -120,4 +118,4 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _share(value: float) -> str:
-    return "?" if np.isnan(value) else f"{max(value, 0):.0%}"
+    return "an unknown part" if np.isnan(value) else f"{value:.0%}" if value > 0 else "nothing"

@@ -111,12 +111,7 @@ def find_disentanglement(
     vectors = np.concatenate([part.mean.reshape(len(part.mean), -1) for part in generators], axis=1)  # (A, ...)
     opposites = measures.opposites(vectors)
     blocks = [(group, found[:, i]) for group, found in split(model, states) for i in range(found.shape[1])]
-    n = len(blocks)
-    redundancy = np.eye(n)
-    for i in range(n):
-        for j in range(i):
-            pair = (blocks[i][1].flatten(1), blocks[j][1].flatten(1))
-            redundancy[i, j] = redundancy[j, i] = measures.canonical_correlation(*pair)
+    redundancy = measures.canonical_correlations([block.flatten(1) for _, block in blocks])
     information = gap = None
     if factors is not None:
         labels = [[measures.cells(part.flatten(1)) for part in frame(*block) if part is not None] for block in blocks]
@@ -159,7 +154,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
         )
         distances = [normalized_distance(left, x) for x in (right, plain, right[partner])]
     away = _block_norms(model, (rho - group.identity(dtype=rho.dtype, device=rho.device)).flatten(1))
-    return ActionSymmetry(*(float(x.mean()) for x in distances), from_identity=float(away.mean()))
+    return ActionSymmetry(*(float(x.mean()) for x in (*distances, away)))
 
 
 def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchObs) -> Collapse:

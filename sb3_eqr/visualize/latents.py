@@ -60,6 +60,7 @@ def play(
     :return: every window that was complete, in order
     :raises ValueError: if there are too few steps
     """
+    env = model._wrap_env(env, monitor_wrapper=False)  # images channels first, as the agent's own environment
     check_number("depth", depth, 1, whole=True)
     check_number("n_steps", n_steps, (2 * depth + 2) * env.num_envs, whole=True)
     buffer = SequenceReplayBuffer(

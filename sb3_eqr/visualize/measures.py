@@ -93,9 +93,9 @@ def angle_moments(angles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     :param angles: radians, (N, ...)
     :return: (...), (...)
     """
-    sin, cos = angles.sin().mean(dim=0), angles.cos().mean(dim=0)
+    sin, cos = angles.double().sin().mean(dim=0), angles.double().cos().mean(dim=0)
     length = th.hypot(sin, cos).clamp(min=1e-12, max=1)
-    return th.atan2(sin, cos), (-2 * length.log()).clamp(min=0).sqrt()
+    return th.atan2(sin, cos), (2 * length.log()).abs().sqrt()
 
 
 def concentration(weights: np.ndarray, axis: int) -> np.ndarray:
@@ -139,20 +139,22 @@ def merged(weights: np.ndarray, pairs: list[int]) -> np.ndarray:
     return np.stack([(weights[a] + weights[b]) / 2 for a, b in enumerate(pairs) if a <= b])
 
 
-def canonical_correlation(first: th.Tensor, second: th.Tensor) -> float:
+def canonical_correlations(blocks: list[th.Tensor]) -> np.ndarray:
     """
-    Mean canonical correlation (Hotelling 1936): that of the best matched linear combinations, over the smaller number of
-    directions in which either varies. 1: one can be read off the other linearly; 0: uncorrelated.
+    Mean canonical correlation of each two blocks (Hotelling 1936): that of the best matched linear combinations, over the
+    smaller number of directions in which either varies. 1: one can be read off the other linearly; 0: uncorrelated.
 
-    :param first: (N, d)
-    :param second: (N, e)
-    :return: in [0, 1]; 0 where either is constant
+    :param blocks: K of (N, d), each with its own d
+    :return: (K, K), in [0, 1], 1 on the diagonal; 0 where either is constant
     """
-    bases = [_directions(x) for x in (first, second)]
-    rank = min(basis.shape[1] for basis in bases)
-    if rank == 0:
-        return 0.0
-    return float(th.linalg.svdvals(bases[0].T @ bases[1])[:rank].clamp(max=1).mean())
+    bases = [_directions(x) for x in blocks]
+    found = np.eye(len(bases))
+    for i, first in enumerate(bases):
+        for j, second in enumerate(bases[:i]):
+            rank = min(first.shape[1], second.shape[1])
+            if rank:
+                found[i, j] = found[j, i] = float(th.linalg.svdvals(first.T @ second)[:rank].clamp(max=1).mean())
+    return found
 
 
 def _directions(x: th.Tensor) -> th.Tensor:

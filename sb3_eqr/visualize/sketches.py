@@ -11,7 +11,7 @@ from sb3_eqr.visualize.latents import frame, split
 
 ARROW = 0.4  # length of a unit arrow that stands on a dot, in half panels
 ROOM = 0.85  # how far into the panel the outermost thing reaches
-GHOST_ROOM = 2.0  # a panel grows for wild predictions up to so many times what the truth needs
+GHOST_ROOM = 3.0  # a panel grows for its predictions if that takes at most so many times what the truth needs
 # How three dimensions are seen: from 60° to the left and 25° above, as matplotlib does. (3, 2)
 VIEW = np.array([[0.866, -0.211], [0.5, 0.366], [0.0, 0.906]])
 
@@ -110,7 +110,7 @@ def _seen(vectors: np.ndarray) -> np.ndarray:
     """(..., n) -> (..., 2)"""
     n = vectors.shape[-1]
     if n == 1:
-        return np.concatenate([vectors, np.zeros_like(vectors)], axis=-1)
+        return np.concatenate([vectors, 0 * vectors], axis=-1)
     return vectors @ VIEW if n == 3 else vectors[..., :2]
 
 
@@ -126,7 +126,8 @@ def _principal_axes(vectors: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _extent(truth: np.ndarray, ghost: np.ndarray) -> float:
-    """The half width that truth needs, or wilder ghosts up to a limit."""
+    """The half width that truth needs, or nearly all ghosts, unless they are too wild to be worth it."""
     needed = max(float(truth.max()), 1e-6)
     found = ghost[np.isfinite(ghost)]
-    return min(max(needed, float(found.max(initial=0.0))), GHOST_ROOM * needed)
+    wanted = float(np.quantile(found, 0.98)) if len(found) > 0 else 0.0
+    return max(needed, wanted) if wanted <= GHOST_ROOM * needed else needed

@@ -1,0 +1,118 @@
+"""The diagnostics of a latent model in TensorBoard, while it trains."""
+
+import warnings
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
+
+from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
+from sb3_eqr.visualize.latent_figure import latent_figure
+from sb3_eqr.visualize.latents import encode, replayed
+
+NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
+EXCLUDED = (*NO_PICTURES.values(), "log")  # the name of HumanOutputFormat's file
+
+
+class LatentCallback(BaseCallback):
+    """
+    Callback for looking at the latent model of an EqR agent in training, on windows from its own replay buffer.
+
+    It logs, under ``latent/``: ``skill`` and ``gain``, the share of the rollout's error that the model takes away from knowing
+    nothing and from standing still (as trained, all steps ahead together); ``effective_rank``, ``spread`` and
+    ``dead_units`` of the encoder; ``specificity`` and ``redundancy`` of the blocks, on average; ``symmetry_distance``, the
+    distance of the GET loss; ``reward_explained``; and a picture of the blocks, ``blocks``, coloured by their age. See
+    :func:`~sb3_eqr.visualize.diagnostics.diagnose`. What does not exist for an agent is not logged.
+
+    Training is the same, to the bit, with and without it: it has a random generator of its own, seeded by the agent's
+    seed and the step, and the networks look in eval mode.
+
+    :param log_freq: Look whenever so many steps of the environments are over, all counted. The logger is dumped then, as
+        SB3's ``EvalCallback`` does
+    :param n_windows: How many windows to look at, drawn with replacement
+    :param pictures: Whether to draw, where the logger can take pictures (TensorBoard can)
+    :param verbose: Verbosity level: 0 for no output, 1 for a line whenever it has looked
+    :raises ValueError: for an argument out of its range; where training starts, if the agent is no EqR agent
+    """
+
+    model: EqRAlgorithm
+
+    def __init__(self, log_freq: int = 5000, n_windows: int = 256, pictures: bool = True, verbose: int = 0):
+        super().__init__(verbose)
+        check_number("log_freq", log_freq, 1, whole=True)
+        check_number("n_windows", n_windows, 8, whole=True)
+        self.log_freq = log_freq
+        self.n_windows = n_windows
+        self.pictures = pictures
+        self._looks = 0  # whole intervals that are over
+        self._has_warned = False
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, EqRAlgorithm):
+            raise ValueError(
+                f"LatentCallback: expected an EqR agent (EqRQRDQN, EqRRainbow), found {type(self.model).__name__}, "
+                "which has no latent model. Leave the callback out."
+            )
+
+    def _on_training_start(self) -> None:
+        self._looks = self.num_timesteps // self.log_freq
+
+    def _on_step(self) -> bool:
+        looks = self.num_timesteps // self.log_freq
+        if looks > self._looks:
+            self._looks = looks
+            self._look()
+        return True
+
+    def _look(self) -> None:
+        buffer = self.model.replay_buffer
+        assert buffer is not None
+        if self.model.depth == 0:  # the buffer makes no rollouts, and nothing trains κ
+            if not self._has_warned:
+                warnings.warn(
+                    "LatentCallback: expected an agent whose latent model is trained, found prediction_depth=0 or all of "
+                    "aet_coef, get_coef and reward_coef 0: there is nothing to look at. Leave the callback out."
+                )
+            self._has_warned = True
+            return
+        if buffer.prediction_depth == 0 or buffer.n_starts < 1:
+            return  # no window is complete yet
+        play = replayed(self.model, self.n_windows, np.random.default_rng([self.model.seed or 0, self.num_timesteps]))
+        found = diagnose(self.model, play)
+        for name, value in scalars(found).items():
+            if np.isfinite(value):
+                self.logger.record(f"latent/{name}", value)
+        if self.pictures and any(type(kind) not in NO_PICTURES for kind in self.logger.output_formats):
+            ages = (buffer.pos - 1 - play.samples.indices // buffer.n_envs) % buffer.buffer_size
+            figure = latent_figure(self.model, encode(self.model, play.samples.observations), ages, "steps ago")
+            self.logger.record("latent/blocks", Figure(figure, close=False), exclude=EXCLUDED)
+        if self.verbose >= 1:
+            print(f"{self.num_timesteps} steps: {found.summary}")
+        self.logger.dump(self.num_timesteps)
+
+
+def scalars(found: Diagnostics) -> dict[str, float]:
+    """
+    :param found: of :func:`~sb3_eqr.visualize.diagnostics.diagnose`
+    :return: what is worth a curve; NaN for what does not exist
+    """
+    skill, gain = skill_and_gain(found.loss)
+    blocks = found.disentanglement
+    return {
+        "skill": skill,
+        "gain": gain,
+        "effective_rank": found.collapse.effective_rank,
+        "spread": found.collapse.spread,
+        "dead_units": found.collapse.dead_units,
+        "specificity": _mean(blocks.specificity),
+        "redundancy": _mean(blocks.redundancy[~np.eye(len(blocks.redundancy), dtype=bool)]),
+        "symmetry_distance": np.nan if found.action_symmetry is None else found.action_symmetry.distance,
+        "reward_explained": _mean(found.rewards.explained),
+    }
+
+
+def _mean(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) > 0 else np.nan

@@ -1,0 +1,221 @@
+"""
+Pictures of a diagnosis, at 6×4 inches. They need no display, and matplotlib's ``pyplot`` is not used, so that nothing has to
+be closed.
+"""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
+from sb3_eqr.visualize.latent_figure import latent_figure
+from sb3_eqr.visualize.measures import ROUNDING, Transition
+from sb3_eqr.visualize.style import COLORS, GREY, LINES, MARKERS, MAX_PANELS, SIZE, n_columns, panels, settings
+from sb3_eqr.visualize.tables import factor_names
+
+__all__ = ["all_pictures", "latent_figure", "write_pictures"]
+
+DPI = 150
+MAX_COORDINATES = 6  # of a block, in one panel
+MAX_NUMBERS = 36  # in a heat map
+MAX_LETTERS = 72  # beside each other at the foot of a figure
+
+
+def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequence[str] = ()) -> dict[str, Figure]:
+    """
+    :param diagnostics: of :func:`~sb3_eqr.visualize.diagnostics.diagnose`
+    :param actions: names of the actions, (A,)
+    :param factors: names of the true factors, (F,), where known
+    :return: name of the file without suffix -> figure
+    """
+    with settings():
+        return {
+            "transition": transition_figure(diagnostics),
+            "motion": motion_figure(diagnostics, actions),
+            "generators": generators_figure(diagnostics, actions),
+            "disentanglement": disentanglement_figure(diagnostics, factors),
+            "collapse": spectrum_figure(diagnostics),
+            "rewards": rewards_figure(diagnostics),
+        }
+
+
+def write_pictures(figures: dict[str, Figure], folder: pathlib.Path) -> None:
+    """Each figure as PNG, written beside its place and renamed."""
+    for name, figure in figures.items():
+        with atomic_write(folder / f"{name}.png", "png") as file, settings():
+            figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def transition_figure(diagnostics: Diagnostics) -> Figure:
+    """Errors of the rollout per step ahead beside those of knowing nothing and of standing still."""
+    figure = Figure(figsize=SIZE, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _errors(left, diagnostics.transition, "latent space: mean ‖x̂ − x‖²")
+    _errors(right, diagnostics.loss, "as trained: unit vectors p(x̂), p(x)")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.suptitle(f"Transition: {diagnostics.verdict}", fontsize=10)
+    return figure
+
+
+def _errors(ax: Axes, errors: Transition, title: str) -> None:
+    named = {"predicted": errors.error, "shuffled (knows nothing)": errors.shuffled, "standing still": errors.still}
+    _lines(ax, named)
+    ax.set_title(title, loc="left")
+    if max(np.nanmax(values, initial=0) for values in named.values()) > 0:
+        ax.set_yscale("log")
+
+
+def _lines(ax: Axes, named: dict[str, np.ndarray]) -> None:
+    for i, (name, values) in enumerate(named.items()):
+        steps = np.arange(1, len(values) + 1)
+        ax.plot(steps, values, color=COLORS[i], linestyle=LINES[i], marker=MARKERS[i], label=name)
+    ax.set_xlabel("steps ahead")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
+
+
+def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
+    """How far each action moves each block: as predicted in every state, and as observed where it was played."""
+    figure = Figure(figsize=SIZE, layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, values, title in zip(axes, diagnostics.motion, ("predicted", "observed"), strict=True):
+        _heat_map(figure, ax, values, f"{title} motion", vmin=0)
+        _block_ticks(ax, diagnostics.blocks)
+    axes[0].set_yticks(range(len(actions)), actions, fontsize=8 if len(actions) < 12 else 6)
+    axes[0].set_ylabel("action")
+    return figure
+
+
+def _heat_map(figure: Figure, ax: Axes, values: np.ndarray, title: str, vmin: float, vmax: float | None = None) -> None:
+    ax.set_facecolor("#dddddd")  # where nothing is known
+    image = ax.imshow(
+        np.ma.masked_invalid(values), cmap="viridis", aspect="auto", interpolation="nearest", vmin=vmin, vmax=vmax
+    )
+    figure.colorbar(image, ax=ax, location="bottom", shrink=0.9, aspect=30)
+    if values.size <= MAX_NUMBERS:
+        top = np.nanmax(values, initial=0) if vmax is None else vmax
+        for (row, column), value in np.ndenumerate(values):
+            dark = value < 0.6 * top
+            ax.text(column, row, f"{value:.2g}", ha="center", va="center", color="white" if dark else "black")
+    ax.set_title(title, loc="left")
+
+
+def _block_ticks(ax: Axes, blocks: Sequence[str]) -> None:
+    every = -(-len(blocks) // 12)
+    ax.set_xticks(range(0, len(blocks), every), [str(k) for k in range(0, len(blocks), every)])
+    groups = list(dict.fromkeys(block.rsplit(" ", 1)[0] for block in blocks))
+    ax.set_xlabel(f"block ({', '.join(groups)})")
+
+
+def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
+    """A panel per block: the coordinates of κ(x, a) for every action, mean and standard deviation over states."""
+    motion = diagnostics.motion.predicted.sum(axis=0)  # (K,)
+    shown = sorted(np.argsort(-motion, kind="stable")[:MAX_PANELS])
+    places = [(part, k) for part in diagnostics.generators for k in range(part.mean.shape[1])]
+    figure = Figure(figsize=SIZE, layout="constrained")
+    axes = panels(figure, len(shown), sharey=True)
+    drawn: dict[str, Any] = {}
+    for ax, block in zip(axes, shown, strict=True):
+        part, k = places[block]
+        _generator(ax, part, k, drawn)
+        ax.set_title(diagnostics.blocks[block], loc="left", pad=2)
+        ax.set_xticks(range(len(actions)), [])
+    for ax in axes[-n_columns(len(axes)) :]:
+        labels = actions if len(actions) <= 6 else [str(a) for a in range(len(actions))]
+        upright = max(map(len, labels)) * len(labels) * n_columns(len(axes)) > MAX_LETTERS
+        ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=6)
+    part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks: those it moves most)"
+    figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
+    return figure
+
+
+def _generator(ax: Axes, part: Generators, k: int, drawn: dict[str, Any]) -> None:
+    ax.axhline(0, color=GREY, linewidth=0.6)
+    ax.set_xlim(-0.6, len(part.mean) - 0.4)
+    largest = np.argsort(-np.abs(part.mean[:, k]).sum(axis=0), kind="stable")[:MAX_COORDINATES]
+    n_actions = len(part.mean)
+    for i, c in enumerate(sorted(largest)):
+        shift = (i - (len(largest) - 1) / 2) * 0.6 / max(len(largest), 2)  # so that bars do not hide each other
+        name = part.names[c] if len(largest) == len(part.names) else f"coordinate {i + 1} of {MAX_COORDINATES}"
+        drawn.setdefault(
+            name,
+            ax.errorbar(
+                np.arange(n_actions) + shift,
+                part.mean[:, k, c],
+                part.std[:, k, c],
+                color=COLORS[i],
+                marker=MARKERS[i],
+                linestyle="",
+                markersize=3,
+                elinewidth=1,
+            ),
+        )
+
+
+def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()) -> Figure:
+    """Correlation between blocks, and where the true factors are known what each block knows of them."""
+    found = diagnostics.disentanglement
+    figure = Figure(figsize=SIZE, layout="constrained")
+    axes = figure.subplots(1, 1 if found.information is None else 2, squeeze=False)[0]
+    _heat_map(figure, axes[0], found.redundancy, "correlation between blocks", vmin=0, vmax=1)
+    _block_ticks(axes[0], diagnostics.blocks)
+    axes[0].set_yticks(axes[0].get_xticks())
+    axes[0].set_ylabel("block")
+    if found.information is not None:
+        names = factor_names(found.information.shape[1], factors)
+        _heat_map(figure, axes[1], found.information.T, "information on true factors", vmin=0, vmax=1)
+        _block_ticks(axes[1], diagnostics.blocks)
+        axes[1].set_yticks(range(len(names)), names)
+    return figure
+
+
+def spectrum_figure(diagnostics: Diagnostics) -> Figure:
+    """Standard deviations of the states along their principal axes."""
+    found = diagnostics.collapse
+    figure = Figure(figsize=SIZE, layout="constrained")
+    ax = figure.subplots()
+    ax.plot(np.arange(1, len(found.spectrum) + 1), found.spectrum, color=COLORS[0], marker="o", markersize=3, linewidth=1)
+    ax.axvline(
+        found.effective_rank,
+        color=COLORS[1],
+        linestyle="--",
+        label=f"effective rank {found.effective_rank:.1f} of {found.dimensions}",
+    )
+    ax.set(xlabel="principal axis", ylabel="standard deviation")
+    if found.spectrum[0] > 0:
+        ax.set_yscale("log")
+        ax.set_ylim(found.spectrum[0] * ROUNDING, 2 * found.spectrum[0])
+        ax.set_xlim(0, int((found.spectrum > found.spectrum[0] * ROUNDING).sum()) + 1)
+    ax.legend()
+    ax.set_title(
+        f"Spectrum of the latent states: they spread by {found.spread:.1%} of their size;\n"
+        f"{found.dead_units:.0%} of the trunk's {found.n_units} units dead, {found.dormant_units:.0%} dormant",
+        loc="left",
+    )
+    return figure
+
+
+def rewards_figure(diagnostics: Diagnostics) -> Figure:
+    """Error of the predicted reward per step ahead beside that of the mean reward."""
+    found = diagnostics.rewards
+    figure = Figure(figsize=SIZE, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _lines(left, {"predicted": found.error, "mean reward": found.constant})
+    left.set_title("mean squared error", loc="left")
+    left.set_ylim(bottom=0)
+    left.legend()
+    _lines(right, {"explained": found.explained})
+    right.axhline(0, color=GREY, linewidth=0.6)
+    right.set_title("explained variance (1: exact)", loc="left")
+    if np.isnan(found.explained).all():
+        right.text(0.5, 0.6, "no reward varies", transform=right.transAxes, ha="center")
+        right.set(xticks=[], yticks=[])
+    figure.suptitle("Reward prediction", fontsize=10)
+    return figure

@@ -1,0 +1,323 @@
+"""Videos of latent states, and the callback that logs them: what is drawn, told apart from the drawing."""
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_eqr.common.groups import make_group
+from sb3_eqr.common.safe_files import get_rng_state
+from sb3_eqr.visualize import animation
+from sb3_eqr.visualize.animation import predictions, record, shoot
+from sb3_eqr.visualize.callback import LatentCallback
+from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
+from sb3_eqr.visualize.latents import encode
+from sb3_eqr.visualize.pixels import observed_pictures
+from sb3_eqr.visualize.sketches import ARROW, ROOM, Panel, Shape, in_plane, panel
+from tests.models import EITHER
+from tests.toys import ChainEnv, ImageEnv
+
+STEPS, DEPTH = 30, 3
+
+
+def rotation(angle):
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+def elements(name, n=7):
+    """Elements of a group, (n, ...), with all parameters drawn."""
+    group = make_group(name)
+    return group, group.element(th.randn(n, group.num_params, generator=th.Generator().manual_seed(0)))
+
+
+def test_an_arrow_turns_with_the_rotation():
+    """SO(2)'s element for the angle θ takes (1, 0) to (cos θ, -sin θ), by the group's convention."""
+    angles = np.linspace(-3, 3, 13)
+    group = make_group("SO(2)")
+    shape = in_plane(group, group.element(th.as_tensor(angles)[:, None]))
+    assert shape.dots is None
+    np.testing.assert_allclose(np.arctan2(shape.arrows[:, 0, 1], shape.arrows[:, 0, 0]), -angles, atol=1e-6)
+
+
+def test_a_dot_stands_at_the_translation_and_its_arrow_is_the_rotation():
+    group = make_group("SE(2)")
+    shape = in_plane(group, group.element(th.tensor([[0.5, 3.0, -4.0]], dtype=th.float64)))
+    np.testing.assert_allclose(shape.dots, [[3, -4]])
+    np.testing.assert_allclose(shape.arrows, rotation(0.5)[:, 0][None, None])
+
+
+@pytest.mark.parametrize(
+    ("name", "n_arrows", "has_dot", "kind"),
+    [
+        ("SO(2)", 1, False, "arrow"),
+        ("SE(2)", 1, True, "arrow"),
+        ("GL(2)", 2, False, "parallelogram"),
+        ("GL(1)", 1, False, "arrow"),
+        ("SO(3)", 3, False, "axes"),
+        ("SE(3)", 3, True, "axes"),
+        ("SO(4)", 3, False, "axes"),
+        ("SE(1)", 0, True, "dot"),
+        ("T(1)", 0, True, "dot"),
+        ("T(2)", 0, True, "dot"),
+        ("T(5)", 0, True, "dot"),
+        ("none(6)", 0, True, "dot"),
+    ],
+)
+def test_every_group_is_drawn_inside_its_panel(name, n_arrows, has_dot, kind):
+    group, found = elements(name)
+    ghost = found.clone()
+    ghost[:2] = float("nan")
+    drawn = panel("1", group, found, ghost)
+    assert drawn.kind == kind
+    assert (drawn.truth.arrows is None) == (n_arrows == 0) and (drawn.truth.dots is None) != has_dot
+    if n_arrows:
+        assert drawn.truth.arrows.shape == (len(found), n_arrows, 2)
+    foot = np.zeros((len(found), 2)) if drawn.truth.dots is None else drawn.truth.dots
+    tips = foot[:, None] if drawn.truth.arrows is None else foot[:, None] + drawn.truth.arrows
+    assert np.abs(foot).max() <= 1 and np.abs(tips).max() <= 1 + 1e-9
+    for truth, guess in zip(drawn.truth, drawn.ghost, strict=True):
+        if truth is not None:
+            np.testing.assert_array_equal(guess[2:], truth[2:])  # one scale for both
+            assert np.isnan(guess[:2]).all()
+    Painter([drawn], np.zeros(len(found), int), 2, "").paint(1, np.zeros((4, 4, 3), np.uint8), Line(0, "a", 0, 0))
+
+
+def test_lengths_of_arrows_are_those_of_rotations():
+    _, found = elements("SO(2)")
+    np.testing.assert_allclose(
+        np.linalg.norm(panel("1", make_group("SO(2)"), found, found).truth.arrows, axis=-1), ROOM, rtol=1e-6
+    )
+    _, found = elements("SE(2)")
+    np.testing.assert_allclose(
+        np.linalg.norm(panel("1", make_group("SE(2)"), found, found).truth.arrows, axis=-1), ARROW, rtol=1e-6
+    )
+
+
+def test_a_panel_grows_for_predictions_but_not_for_wild_ones():
+    group = make_group("T(2)")
+    truth = th.tensor([[-1.0, 0.0], [1.0, 0.0]])
+    assert panel("1", group, truth, 2 * truth).half_width == pytest.approx(2 / ROOM, rel=0.1)
+    assert panel("1", group, truth, 100 * truth).half_width == pytest.approx(1 / ROOM)
+
+
+def test_without_a_group_two_principal_components_are_drawn():
+    t = th.linspace(-1, 1, 9)
+    vectors = th.outer(t, th.tensor([0.0, 3.0, 4.0, 0.0])) + th.tensor([7.0, 7.0, 7.0, 7.0])
+    drawn = panel("1", make_group("none(4)"), vectors, vectors)
+    np.testing.assert_allclose(drawn.truth.dots, np.stack([t * ROOM, 0 * t], axis=1), atol=1e-6)
+
+
+def rollout(model, state, actions):
+    """x̂ after some actions, by the paper's recursion alone: κ in eval mode moves the state again and again."""
+    latent_model = model.policy.latent_model
+    latent_model.eval()
+    with th.no_grad():
+        for action in actions:
+            one_hot = th.nn.functional.one_hot(th.tensor([int(action)]), latent_model.n_actions).float()
+            params = latent_model.transition(th.cat([state, one_hot], dim=1))
+            group = latent_model.group
+            element = group.element(params.reshape(1, latent_model.n_blocks, group.num_params))
+            state = group.compose(element, state.reshape(1, latent_model.n_blocks, *group.element_shape)).reshape(1, -1)
+    return state
+
+
+def test_a_ghost_is_what_was_predicted_some_steps_before(make):
+    model = make(ChainEnv(8))
+    model.exploration_rate = 1.0  # all actions
+    film = shoot(model, ChainEnv(8), STEPS, 0, False)
+    states = encode(model, film.observations)
+    ghosts = predictions(model, states, film.actions, film.starts, DEPTH)
+    assert len(set(film.starts.tolist())) > 2  # several episodes
+    for t in range(STEPS):
+        if t - film.starts[t] < DEPTH:  # also the first frames of the video
+            assert th.isnan(ghosts[t]).all()
+        else:
+            expected = rollout(model, states[t - DEPTH : t - DEPTH + 1], film.actions[t - DEPTH : t])
+            th.testing.assert_close(ghosts[t : t + 1], expected)
+
+
+@EITHER
+def test_a_film_is_what_happened(make):
+    """The same play by hand."""
+    model = make(ChainEnv(8))
+    film = shoot(model, ChainEnv(8), STEPS, 3, True)
+    env = DummyVecEnv([lambda: ChainEnv(8)])
+    env.seed(3)
+    obs, start = env.reset(), 0
+    for t in range(STEPS):
+        np.testing.assert_array_equal(film.observations[t], obs[0])
+        action, _ = model.predict(obs, deterministic=True)
+        obs, reward, done, _ = env.step(action)
+        assert (film.actions[t], film.starts[t]) == (action[0], start)
+        assert film.rewards[t] == pytest.approx(reward[0])
+        start = t + 1 if done[0] else start
+
+
+@EITHER
+@pytest.mark.parametrize("group", ["SE(2)", "SE(2)^2 x SO(3) x T(2)", "none", None])
+def test_files_have_the_frames_and_generators_are_kept(make, group, tmp_path):
+    network = {"group": group, "n_blocks": None if group in (None, "SE(2)^2 x SO(3) x T(2)") else 3}
+    model = make(ChainEnv(8), get_coef=0, policy_kwargs=network)
+    before = get_rng_state(model.action_space)
+    paths = record(model, ChainEnv(8), tmp_path / "new" / "v1.5", 11, 3)
+    after = get_rng_state(model.action_space)
+    assert before["python"] == after["python"] and before["action_space"] == after["action_space"]
+    assert th.equal(before["torch"], after["torch"]) and (before["numpy"][1] == after["numpy"][1]).all()
+    assert [path.name for path in paths] == ["v1.5.mp4", "v1.5.gif"]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["v1.5.gif", "v1.5.mp4"]
+    movie = imageio.get_reader(paths[0])
+    assert movie.count_frames() == 11 and movie.get_data(10).shape == (HEIGHT, WIDTH, 3)
+    assert len(imageio.mimread(paths[1], memtest=False)) == 6  # every second one
+
+
+@EITHER
+def test_the_same_seed_draws_the_same_frames(make, tmp_path, monkeypatch):
+    model = make(ImageEnv(), "CnnPolicy")
+    model.exploration_rate = 1.0  # ε-greedy actions have a generator of their own
+    seen = []
+    monkeypatch.setattr(animation, "write_video", lambda images, *_: seen.append(np.stack(list(images))))
+    for seed in (0, 0, 1):
+        th.rand(1)
+        model.action_space.sample()
+        record(model, ImageEnv(), tmp_path / "v", 8, 2, seed=seed, deterministic=False)
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert (seen[0] != seen[2]).any()
+
+
+@EITHER
+def test_the_game_is_rendered_where_it_can_be(make):
+    model = make("CartPole-v1")
+    rendered = shoot(model, gym.make("CartPole-v1", render_mode="rgb_array"), 3, 0, True).pictures
+    assert rendered[0].shape == (400, 600, 3)
+    bars = shoot(model, gym.make("CartPole-v1"), 3, 0, True).pictures
+    assert bars[0].shape[2] == 3 and (bars[0] != bars[2]).any()
+
+
+@EITHER
+def test_several_normalised_environments(make):
+    """The first is filmed, with the rewards that it gave."""
+    env = VecNormalize(DummyVecEnv([lambda: ChainEnv(8), lambda: ChainEnv(8)]))
+    model = make(env)
+    plain = VecNormalize(DummyVecEnv([lambda: ChainEnv(8), lambda: ChainEnv(8)]), training=False)
+    film = shoot(model, plain, 9, 0, True)
+    alone = shoot(model, ChainEnv(8), 9, 0, True)
+    assert film.observations.shape == (9, 3) and len(film.rewards) == 9
+    assert film.rewards[0] == pytest.approx(alone.rewards[0], abs=1e-6)
+
+
+def test_what_an_agent_sees_as_a_picture():
+    stack = np.arange(4, dtype=np.uint8)[None, :, None, None] * np.ones((2, 4, 5, 6), np.uint8)
+    newest = observed_pictures(stack, spaces.Box(0, 255, (4, 5, 6), np.uint8), 4)
+    assert len(newest) == 2 and newest[0].shape == (5, 6, 3) and (newest[0] == 3).all()
+    planes = np.zeros((1, 4, 5, 6), np.uint8)
+    planes[0, 1, 2, 3] = 255
+    (picture,) = observed_pictures(planes, spaces.Box(0, 255, (4, 5, 6), np.uint8), 1)
+    assert picture[2, 3].max() == 255 and len(set(picture[2, 3].tolist())) > 1 and picture.sum() == picture[2, 3].sum()
+    space = spaces.Dict({"a": spaces.Box(-1, 1, (3,)), "b": spaces.Box(-1, 1, (20,))})
+    (picture,) = observed_pictures({"a": np.ones((1, 3)), "b": np.ones((1, 20))}, space, 1)
+    assert picture.ndim == 3
+
+
+@EITHER
+def test_nothing_is_left_of_a_video_that_failed(make, tmp_path, monkeypatch):
+    model = make(ChainEnv(8))
+    old = tmp_path / "v.gif"
+    old.write_bytes(b"old")
+    paint = Painter.paint
+
+    def fail(self, t, *args):
+        if t == 5:
+            raise RuntimeError("the disk is full")
+        return paint(self, t, *args)
+
+    monkeypatch.setattr(Painter, "paint", fail)
+    with pytest.raises(RuntimeError, match="the disk is full"):
+        record(model, ChainEnv(8), tmp_path / "v", 9, 2)
+    assert [path.name for path in tmp_path.iterdir()] == ["v.gif"] and old.read_bytes() == b"old"
+
+
+@EITHER
+def test_what_cannot_be_filmed_is_refused(make, tmp_path):
+    model = make(ChainEnv(8))
+    with pytest.raises(ValueError, match="formats: expected some of"):
+        record(model, ChainEnv(), tmp_path / "v", formats=("avi",))
+    with pytest.raises(ValueError, match="n_steps: expected a whole number of at least 6"):
+        record(model, ChainEnv(), tmp_path / "v", n_steps=5)
+    with pytest.raises(ValueError, match="env: expected the agent's observation_space"):
+        record(model, ImageEnv(), tmp_path / "v")
+    with pytest.raises(ValueError, match="model: expected an EqR agent, found DQN"):
+        record(DQN("MlpPolicy", ChainEnv()), ChainEnv(), tmp_path / "v")
+
+
+def test_the_frame_shows_truth_and_ghost():
+    """Blue at the tip of the arrow, orange at the ghost's; without a ghost nothing is orange."""
+    truth = Shape(np.array([[[0.0, 0.85]]] * 2), None)
+    ghost = Shape(np.array([[[np.nan, np.nan]], [[0.85, 0.0]]]), None)
+    painter = Painter([Panel("1", "arrow", truth, ghost, None)], np.zeros(2, int), 1, "")
+    (x, y), side = painter.corners[0], painter.side
+    first, second = (painter.paint(t, np.zeros((4, 4, 3), np.uint8), Line(t, "up", 0, 0)).astype(int) for t in (0, 1))
+    up = second[y + side // 4, x + side // 2]
+    right = second[y + side // 2, x + 3 * side // 4]
+    assert up[2] > up[0] + 50 and right[0] > right[2] + 50
+    inside = first[y : y + side, x : x + side]
+    assert not (inside[..., 0] > inside[..., 2] + 50).any()
+
+
+# --- the callback
+
+
+def trained(make, callback, tmp_path=None, **kwargs):
+    model = make(ChainEnv(), tensorboard_log=None if tmp_path is None else str(tmp_path), **kwargs)
+    model.learn(90, callback=callback)
+    return model
+
+
+def test_training_is_the_same_and_tensorboard_has_what_was_found(make, tmp_path):
+    plain = trained(make, None)
+    watched = trained(make, LatentCallback(log_freq=30, n_windows=16), tmp_path)
+    for (name, a), (_, b) in zip(plain.policy.state_dict().items(), watched.policy.state_dict().items(), strict=True):
+        assert th.equal(a, b), name
+    (folder,) = tmp_path.iterdir()
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    assert [event.step for event in events.Images("latent/blocks")] == [30, 60, 90]
+    for name in ("skill", "gain", "effective_rank", "spread", "dead_units", "specificity", "redundancy", "symmetry_distance"):
+        assert [event.step for event in events.Scalars(f"latent/{name}")] == [30, 60, 90]
+        assert np.isfinite([event.value for event in events.Scalars(f"latent/{name}")]).all()
+
+
+@EITHER
+def test_looking_leaves_the_networks_as_they_were(make):
+    callback = LatentCallback(log_freq=1000, n_windows=16)
+    model = trained(make, callback)
+    model.policy.set_training_mode(True)
+    modes = [module.training for module in model.policy.modules()]
+    before, rng = {k: v.clone() for k, v in model.policy.state_dict().items()}, get_rng_state(model.action_space)
+    callback._look()
+    assert [module.training for module in model.policy.modules()] == modes
+    assert all(th.equal(v, before[k]) for k, v in model.policy.state_dict().items())
+    after = get_rng_state(model.action_space)
+    assert th.equal(rng["torch"], after["torch"]) and (rng["numpy"][1] == after["numpy"][1]).all()
+
+
+@EITHER
+def test_nothing_is_looked_at_before_a_window_is_complete(make, tmp_path):
+    make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(2, callback=LatentCallback(log_freq=1, n_windows=16))
+
+
+@EITHER
+@pytest.mark.parametrize("off", [{"prediction_depth": 0}, {"aet_coef": 0, "get_coef": 0, "reward_coef": 0}])
+def test_an_agent_without_latent_losses_is_told_once(make, off):
+    with pytest.warns(UserWarning, match="there is nothing to look at") as told:
+        trained(make, LatentCallback(log_freq=10), **off)
+    assert len([warning for warning in told if "LatentCallback" in str(warning.message)]) == 1
+
+
+def test_other_agents_are_refused():
+    with pytest.raises(ValueError, match=r"expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN"):
+        DQN("MlpPolicy", ChainEnv()).learn(1, callback=LatentCallback())

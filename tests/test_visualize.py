@@ -1,0 +1,296 @@
+"""A diagnosis tells what an agent's latent model knows; the command line writes it down."""
+
+import functools
+import pickle
+import random
+import re
+import sys
+from collections import OrderedDict
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+import yaml
+from gymnasium import spaces
+from PIL import Image
+from sb3_contrib import QRDQN
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, cli, visualize
+from sb3_eqr.visualize import loading
+from sb3_eqr.visualize.diagnostics import diagnose
+from sb3_eqr.visualize.latents import encode, play
+from sb3_eqr.visualize.pictures import all_pictures, latent_figure
+from sb3_eqr.visualize.tables import all_tables
+
+STEP = 0.4
+FILES = ("transition", "motion", "generators", "disentanglement", "action_symmetry", "collapse", "rewards", "summary")
+PICTURES = ("transition", "motion", "generators", "disentanglement", "collapse", "rewards", "latents")
+
+
+class Ring(gym.Env):
+    """
+    A point on a circle, turned by ±0.4 radians. Seen as (cos, sin, 1); or with ``unwound`` as (angle, 0), the angle growing
+    beyond π; or with ``keys`` as a dictionary.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, unwound=False, keys=False, render_mode=None):
+        box = spaces.Box(-np.inf, np.inf, (2 if unwound else 3,), np.float32)
+        self.observation_space = spaces.Dict({"seen": box}) if keys else box
+        self.action_space = spaces.Discrete(2)
+        self.unwound, self.keys, self.render_mode = unwound, keys, render_mode
+
+    def get_action_meanings(self):
+        return ["BACK", "ON"]
+
+    def tell(self):
+        a = self.angle
+        seen = np.array([a, 0] if self.unwound else [np.cos(a), np.sin(a), 1], dtype=np.float32)
+        return {"seen": seen} if self.keys else seen, {"angle": (a + np.pi) % (2 * np.pi) - np.pi}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.angle, self.time = self.np_random.uniform(-np.pi, np.pi), 0
+        return self.tell()
+
+    def step(self, action):
+        self.angle += STEP * (2 * int(action) - 1)
+        self.time += 1
+        obs, info = self.tell()
+        return obs, float(np.cos(self.angle)), False, self.time >= 40, info
+
+
+gym.register("Ring-v0", entry_point=Ring)
+
+
+def make_model(algorithm=EqRQRDQN, policy="MlpPolicy", env=None, group="SO(2)", n_blocks=2, network=None, **kwargs):
+    heads = {EqRQRDQN: "n_quantiles", EqRRainbow: "n_atoms"}
+    sizes = {"net_arch": [32], "latent_hidden_dim": 32, heads[algorithm]: 9, **(network or {})}
+    settings = {"buffer_size": 2000, "learning_starts": 100, "learning_rate": 2e-3, "n_steps": 3, "prediction_depth": 3}
+    settings |= {"train_freq": 4, "gradient_steps": 4, "tau": 0.05, "device": "cpu", "seed": 0, **kwargs}
+    return algorithm(policy, env or Ring(), **settings, policy_kwargs={"group": group, "n_blocks": n_blocks, **sizes})
+
+
+def look(model, n_steps=300, **kwargs):
+    return diagnose(model, play(model, make_vec_env(functools.partial(Ring, **kwargs)), n_steps, depth=3))
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return make_model().learn(300)
+
+
+def collapse(model):
+    """Every state is one, and κ is the identity."""
+    with th.no_grad():
+        model.policy.online.features_extractor.to_algebra.weight.zero_()
+        for parameter in model.policy.latent_model.transition[-1].parameters():
+            parameter.zero_()
+    return model
+
+
+def test_three_agents_three_verdicts(trained):
+    found = [look(model) for model in (trained, make_model(), collapse(make_model()))]
+    assert [diagnostics.verdict for diagnostics in found] == ["predicts", "does not predict", "collapsed"]
+    assert found[2].collapse.effective_rank == 0 and found[2].collapse.spread < 1e-6
+    assert np.isnan(found[2].loss.skill).all() and "collapsed: over 3 steps" in found[2].summary
+
+
+def by_hand():
+    """x = R(angle), κ(x, a) = R(±0.4), ρ = 1, r = 0: exact where the angle is seen unwound."""
+    model = make_model(env=Ring(unwound=True), n_blocks=1)
+    latent = model.policy.latent_model
+    with th.no_grad():
+        to_algebra = model.policy.online.features_extractor.to_algebra
+        to_algebra.weight.copy_(th.tensor([[1.0, 0.0]]))
+        to_algebra.bias.zero_()
+        for net in (latent.transition, latent.action_symmetry, latent.reward_net):
+            for parameter in (*net[0].parameters(), *net[-1].parameters()):
+                parameter.zero_()
+        latent.transition[0].weight[:2, -2:] = th.eye(2)
+        latent.transition[-1].weight[0, :2] = STEP * th.tensor([-1.0, 1.0]) * (1 + latent.transition[1].eps) ** 0.5
+    return model
+
+
+def test_an_exact_model_is_seen_as_exact():
+    found = look(by_hand(), n_steps=600, unwound=True)
+    chord = 2 * np.sqrt(2) * np.sin(STEP / 2)  # ‖R(0.4) x − x‖, four entries
+    assert found.verdict == "predicts" and found.blocks == ["SO(2) 0"]
+    assert (found.transition.error < 1e-9).all() and (found.transition.skill > 1 - 1e-6).all()
+    assert found.transition.still[0] == pytest.approx(chord**2, rel=1e-4)
+    assert np.allclose(found.motion.predicted, chord, rtol=1e-4) and np.allclose(found.motion.observed, chord, rtol=1e-4)
+    (generators,) = found.generators
+    assert generators.names == ["angle 0-1"] and np.allclose(generators.mean[:, 0, 0], [-STEP, STEP], rtol=1e-4)
+    assert (generators.std < 2e-3).all()
+    assert found.disentanglement.opposites == [1, 0] and np.isnan(found.disentanglement.specificity).all()
+    assert found.disentanglement.information[0, 0] > 0.8 and found.disentanglement.redundancy.tolist() == [[1]]
+    symmetry = found.action_symmetry  # rotations of the plane commute: ρ = 1 is right
+    assert symmetry.distance == symmetry.identity < 1e-9 and symmetry.from_identity == 0 and symmetry.shuffled > 0.1
+    assert found.collapse.size == pytest.approx(np.sqrt(2)) and found.collapse.dimensions == 4
+    assert found.collapse.effective_rank == pytest.approx(2, abs=0.1)  # a circle
+    assert found.collapse.dead_units == found.collapse.dormant_units == 0.5  # the observation that is always 0
+    assert np.allclose(found.rewards.explained, 0, atol=1e-6)
+
+
+def test_rewards_that_never_vary_and_signs():
+    model = make_model(reward_loss="categorical")
+    window = play(model, make_vec_env(Ring), 100, depth=2)
+    found = diagnose(model, window).rewards
+    signs = window.samples.rollout_rewards.sign().numpy()
+    valid = window.samples.mask[:, 0].numpy() > 0
+    assert found.constant[0] == pytest.approx(signs[valid, 0].var(), rel=1e-4)
+    same = window._replace(samples=window.samples._replace(rollout_rewards=th.ones_like(window.samples.rollout_rewards)))
+    assert np.isnan(diagnose(model, same).rewards.explained).all()
+
+
+def generators():
+    return random.getstate(), pickle.dumps(np.random.get_state()), th.get_rng_state().tolist()
+
+
+def test_same_seed_same_numbers_and_global_generators_as_they_were(trained):
+    windows = play(trained, make_vec_env(Ring), 200, depth=3)
+    state = generators()
+    mode = [module.training for module in trained.policy.modules()]
+    first, second = diagnose(trained, windows, seed=3), diagnose(trained, windows, seed=3)
+    assert pickle.dumps(first) == pickle.dumps(second)
+    assert generators() == state
+    assert [module.training for module in trained.policy.modules()] == mode
+    assert diagnose(trained, windows, seed=4).action_symmetry != first.action_symmetry
+
+
+HEISENBERG = MatrixLieGroup([[[0, 1, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 1], [0, 0, 0]]])
+GROUPS = ["GL(1)", "GL(2)", "SE(2)", "SE(3)", "SO(2)", "SO(3)", "T(1)", "T(2)", "T(3)", HEISENBERG]
+
+
+@pytest.mark.parametrize("group", [*GROUPS, "SE(2)^3 x SO(3)^2 x T(2)", "none(5)", None], ids=str)
+def test_every_group(group):
+    whole = group is None or "(" not in str(group).replace("none(5)", "").split(" x ")[0] or " x " in str(group)
+    n_blocks = None if whole else 3
+    algorithm = EqRRainbow if whole else EqRQRDQN
+    inverse = group is not None and not str(group).startswith("none")
+    model = make_model(algorithm, group=group, n_blocks=n_blocks, get_coef=float(inverse))
+    windows = play(model, make_vec_env(Ring), 120, depth=3)
+    found = diagnose(model, windows)
+    k = {None: 1, "none(5)": 1, "SE(2)^3 x SO(3)^2 x T(2)": 6}.get(group, 3)
+    assert len(found.blocks) == k and found.motion.predicted.shape == (2, k)
+    assert np.isfinite(found.motion.predicted).all() and np.isfinite(found.transition.error).all()
+    assert sum(part.mean.shape[1] for part in found.generators) == k
+    assert found.disentanglement.information.shape == (k, 1) and (found.action_symmetry is not None) == inverse
+    assert set(all_tables(found, ["0", "1"])) == set(FILES)
+    all_pictures(found, ["0", "1"])
+    latent_figure(model, encode(model, windows.samples.observations), windows.factors[:, 0], "angle")
+
+
+def test_dict_observations_and_an_agent_without_latent_losses():
+    model = make_model(EqRRainbow, "MultiInputPolicy", Ring(keys=True), prediction_depth=0)
+    assert look(model, keys=True).verdict == "does not predict"
+
+
+def test_many_blocks_and_points_in_one_figure():
+    model = make_model(group="T(2)", n_blocks=32)
+    figure = latent_figure(model, th.randn(1000, 64, generator=th.Generator().manual_seed(0)))
+    assert len(figure.axes) == 12 + 1 and "12 of 32" in figure._suptitle.get_text()
+    assert len(latent_figure(model, th.zeros(3, 64)).axes) == 13  # all the same
+
+
+@pytest.fixture
+def sb3_eqr(monkeypatch, capfd):
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["sb3-eqr", "visualize", *map(str, arguments)])
+        try:
+            cli.main()
+        except SystemExit as left:
+            return left.code, capfd.readouterr()
+        return 0, capfd.readouterr()
+
+    return call
+
+
+def test_command_line(trained, sb3_eqr, tmp_path):
+    trained.save(tmp_path / "ring")
+    code, out = sb3_eqr(tmp_path / "ring.zip", "--env", "Ring-v0", "--steps", 200, "--n-envs", 2, "--out", tmp_path / "out")
+    assert code == 0 and out.out.startswith("predicts: over 3 steps") and str(tmp_path / "out") in out.out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {f"{n}.csv" for n in FILES} | {f"{n}.png" for n in PICTURES}
+    tables = {name: pd.read_csv(tmp_path / "out" / f"{name}.csv") for name in FILES}
+    assert tables["transition"]["steps_ahead"].tolist() == [1, 2, 3]
+    assert tables["generators"]["action_name"].unique().tolist() == ["BACK", "ON"]
+    information = tables["disentanglement"].query("measure == 'information'")
+    assert information["with"].tolist() == ["angle", "angle"]
+    assert tables["summary"].set_index("measure").at["verdict", "value"] == "predicts"
+    for name in PICTURES:
+        assert Image.open(tmp_path / "out" / f"{name}.png").size == (900, 600)
+
+
+def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
+    folder = tmp_path / "Ring-v0_1" / "Ring-v0"
+    folder.mkdir(parents=True)
+    env = VecNormalize(make_vec_env(functools.partial(Ring, keys=False)))
+    model = make_model(env=env)
+    model.save(folder.parent / "best_model")
+    env.obs_rms.mean[:] = 7
+    env.save(folder / "vecnormalize.pkl")
+    (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Ring-v0", env_kwargs=None, gym_packages=[])))
+    (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", normalize=True)))
+    path = folder.parent / "best_model.zip"
+    loaded = loading.load_model(path, device="cpu")
+    assert type(loaded) is EqRQRDQN
+    found = loading.make_env(loaded, path)
+    assert isinstance(found, VecNormalize) and found.obs_rms.mean[0] == 7 and not found.training and not found.norm_reward
+    other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
+    assert other.num_envs == 2
+
+
+def test_the_algorithm_is_in_the_file(tmp_path):
+    make_model(EqRRainbow).save(tmp_path / "rainbow")
+    assert loading.find_algorithm(tmp_path / "rainbow.zip") == "eqr_rainbow"
+    QRDQN("MlpPolicy", Ring(), device="cpu").save(tmp_path / "stock")
+    with pytest.raises(ValueError, match=r"expected an agent of EqRQRDQN or EqRRainbow, found .*sb3_contrib\.qrdqn\.policies"):
+        loading.load_model(tmp_path / "stock.zip")
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("", "the following arguments are required: MODEL"),
+        ("nothing.zip", "MODEL: expected the path of a .zip file, such as .*, found 'nothing.zip'"),
+        ("{cut}", "expected a whole file of an agent's save, found one that is cut off"),
+        ("{model}", r"--env: expected the environment of the agent, .* \(args.yml\) beside"),
+        ("{model} --env Rnig-v0", "'Rnig-v0' is not registered with gymnasium. Did you mean 'Ring-v0'?"),
+        ("{model} --env CartPole-v1", "the environment is not the agent's. Observation spaces do not match"),
+        ("{model} --env Ring-v0 --env-kwargs unwound", "--env-kwargs: expected key:value, found 'unwound'"),
+        ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not take {'speed': 2}"),
+        ("{model} --env Ring-v0 --steps 5", "n_steps: expected .*8.*found 5"),
+        ("{model} --env Ring-v0 --depth 0", "depth: expected .*1.*found 0"),
+        ("{model} --env Ring-v0 --n-envs 0", "--n-envs: expected at least 1, found 0"),
+        ("{model} --env ALE/Pong-v5 --env-kwargs mode:1", "--env-kwargs: expected none for Atari"),
+        ("{model} --algo dqn", "invalid choice: 'dqn'"),
+    ],
+)
+def test_wrong_use_is_told(line, message, sb3_eqr, tmp_path_factory, capfd):
+    folder = tmp_path_factory.mktemp("wrong")
+    make_model().save(folder / "model")
+    (folder / "cut.zip").write_bytes(b"PK")
+    code, out = sb3_eqr(*line.format(model=folder / "model.zip", cut=folder / "cut.zip").split())
+    assert code == 2
+    assert re.search(message, out.err.replace("\n", " ")), out.err
+
+
+def test_kwargs_are_python_or_text():
+    assert loading.parse_kwargs(["a:1", "b:[2, 3]", "c:None", "d:text", "e:a:b"]) == {
+        "a": 1,
+        "b": [2, 3],
+        "c": None,
+        "d": "text",
+        "e": "a:b",
+    }
+
+
+def test_public_names():
+    assert visualize.diagnose is diagnose and visualize.play is play
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        visualize.nothing  # noqa: B018
