@@ -147,7 +147,7 @@ def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, 
     title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
     progress = pd.read_csv(out / "progress.csv")
     draw(progress, scores, float(np.mean(found)), model.learning_starts, title, out / "training.png")
-    env = make_atari100k_env(args.game, training=False)
+    env = make_atari100k_env(args.game, training=False, render_mode="rgb_array")
     # As it explores: without noise a young agent holds one button down.
     record(model, env, out / "latents", ANIMATION_STEPS, seed=args.seed + 20_000, deterministic=False)
 

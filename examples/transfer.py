@@ -3,8 +3,8 @@ Does a representation help another task? A ball on a torus, two goals: what move
 
     python examples/transfer.py --seeds 0 1 2 3 4      # the table of docs/transfer.md: an hour on one thread
 
-Per seed, an agent learns goal A; agents for goal B start from scratch, from A's representation, from A's representation frozen,
-and from one that was learned without any goal. Leaves models, evaluations and results.jsonl in --out; finished runs are not
+Per seed, an agent learns goal A; agents for goal B start from scratch, from A's representation (frozen, too), and
+from one that was learned without any goal. Leaves models, evaluations and results.jsonl in --out; finished runs are not
 repeated.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.envs import register
@@ -32,7 +33,7 @@ EVAL_EPISODES = 25
 def make_env(goal: str | None, n_envs: int, seed: int) -> Any:
     """A torus with a goal, episodes of at most 50 steps; a shortest way takes 4 on average, at most 8."""
     kwargs = {"n_steps": N_STEPS, "goal": None if goal is None else GOALS[goal], "max_episode_steps": 50}
-    return make_vec_env("SlidingBallTorus-v0", n_envs, seed, env_kwargs=kwargs)
+    return VecTransposeImage(make_vec_env("SlidingBallTorus-v0", n_envs, seed, env_kwargs=kwargs))
 
 
 def make_agent(goal: str, seed: int, frozen: bool) -> EqRQRDQN:

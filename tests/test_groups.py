@@ -20,6 +20,7 @@ GROUPS = [
     *[(name, "euler") for name in ("GL(1)", "GL(2)", "GL(4)", "T(1)", "T(5)", "SE(1)", "SE(2)", "SE(3)", "SE(5)")],
     *[(name, "euler") for name in ("SO(2)", "SO(3)", "SO(6)", "SE(2)^8 x SO(3)^4", "T(2) x GL(2)^3")],
     *[(name, "exp") for name in ("SO(2)", "SO(3)", "SO(6)", "SE(1)", "SE(2)", "SE(4)", "SE(2)^2 x SO(3)")],
+    *[(name, "gram-schmidt") for name in ("SO(2)", "SO(3)", "SO(5)", "SE(1)", "SE(2)", "SE(3)", "SE(2)^2 x SO(3)")],
     (MatrixLieGroup(AFFINE_1D), "exp"),
 ]
 IDS = [f"{name}-{parameterization}" for name, parameterization in GROUPS]
@@ -81,12 +82,48 @@ def random_params(group, seed):
 
 @pytest.mark.parametrize("n", [2, 3, 6])
 @pytest.mark.parametrize("kind", ["SO", "SE"])
-@pytest.mark.parametrize("parameterization", ["euler", "exp"])
+@pytest.mark.parametrize("parameterization", ["euler", "exp", "gram-schmidt"])
 def test_rotations_are_rotations(n, kind, parameterization):
     rotation = random_elements(make_group(f"{kind}({n})", parameterization), 7)[..., :n, :n]
     eye = th.eye(n, dtype=th.float64).expand(7, n, n)
     th.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-12)
     th.testing.assert_close(th.linalg.det(rotation), th.ones(7, dtype=th.float64), rtol=0, atol=1e-12)
+
+
+def test_gram_schmidt_against_the_qr_decomposition():
+    for n in (2, 3, 5):
+        columns = np.random.default_rng(n).normal(size=(n, n))
+        q, r = np.linalg.qr(columns)
+        q = q * np.sign(np.diag(r))  # the decomposition with a positive diagonal is the one of Gram and Schmidt
+        q[:, -1] *= np.linalg.det(q)  # of the two that complete it, the rotation
+        params = th.as_tensor(columns[:, :-1].T.reshape(1, -1).copy())
+        np.testing.assert_allclose(make_group(f"SO({n})", "gram-schmidt").element(params)[0].numpy(), q, atol=1e-12)
+
+
+def test_gram_schmidt_has_no_seam_and_a_direction_at_zero():
+    group = make_group("SO(2)", "gram-schmidt")
+    by_hand = th.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=th.float64)
+    th.testing.assert_close(group.element(th.tensor([3.0, 4.0], dtype=th.float64)), by_hand)
+    for dtype in (th.float32, th.float64):
+        for name in ("SO(2)", "SO(3)", "SE(3)"):
+            zero = make_group(name, "gram-schmidt")
+            found = zero.element(th.zeros(1, zero.num_params, dtype=dtype))
+            assert th.equal(found, zero.identity(1, dtype=dtype))
+    loop = th.linspace(0, 2 * np.pi, 361, dtype=th.float64)
+    elements = group.element(th.stack([loop.cos(), loop.sin()], dim=1))  # numbers that close, as a network's on a loop do
+    assert (elements[1:] - elements[:-1]).abs().max() < 0.02  # never a jump
+    steps = th.atan2(elements[1:, 1, 0], elements[1:, 0, 0]) - th.atan2(elements[:-1, 1, 0], elements[:-1, 0, 0])
+    assert abs(th.remainder(steps + np.pi, 2 * np.pi).sub(np.pi).sum().item() - 2 * np.pi) < 1e-9  # and once around
+
+
+@pytest.mark.parametrize("name", ["SO(3)", "SE(2)", "SE(2)^2 x SO(3)", "T(2)", "GL(2)"])
+def test_actions_are_parameterized_around_the_identity(name):
+    group = make_group(name, "gram-schmidt")
+    actions = group.for_actions
+    assert actions.element_shape == group.element_shape and actions.name == group.name
+    if name != "GL(2)":
+        assert th.equal(actions.element(th.zeros(2, actions.num_params)), group.identity(2))
+    assert make_group(name, "exp").for_actions.num_params == actions.num_params
 
 
 def test_euler_and_exp_agree_on_so2():

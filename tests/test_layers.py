@@ -1,8 +1,9 @@
+import numpy as np
 import torch as th
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
-from sb3_eqr.common.layers import ConvTrunk, DistributionalHead, NoisyLinear
+from sb3_eqr.common.layers import ConvTrunk, DistributionalHead, NoisyLinear, Whitening
 
 
 def test_noise_is_factorised_and_fresh():
@@ -98,3 +99,44 @@ def test_intensity_scales_each_image_by_one_number():
     before = images.float()
     random_intensity(before, scale=0.5)
     assert th.equal(before, images.float())  # the caller's images stay
+
+
+def correlated(n, dtype=th.float64):
+    """Features of rank 3 and very different sizes, far from 0."""
+    mixing = th.tensor([[1.0, 2.0, 0.0], [0.0, 1e-3, 5e-4], [3.0, 0.0, 40.0]], dtype=dtype)
+    return th.randn(n, 3, dtype=dtype) @ mixing + 100.0
+
+
+def test_whitened_features_have_no_mean_no_correlation_and_variance_one():
+    th.manual_seed(0)
+    whitening = Whitening(3).double()
+    features = correlated(3000)
+    white = whitening(features).detach().numpy()
+    np.testing.assert_allclose(white.mean(axis=0), 0, atol=1e-10)
+    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(3), atol=0.02)  # 3 / 3003 of a correlation is not believed
+    for _ in range(100):
+        whitening(correlated(3000))
+    whitening.eval()
+    before = whitening.running_mean.clone()
+    np.testing.assert_allclose(np.cov(whitening(correlated(3000)).numpy().T), np.eye(3), atol=0.1)
+    assert th.equal(before, whitening.running_mean)
+
+
+def test_whitening_one_feature_is_batch_norm():
+    features = th.randn(16, 1, dtype=th.float64) * 7 + 3
+    expected = nn.BatchNorm1d(1, affine=False, eps=0).double()(features)
+    th.testing.assert_close(Whitening(1).double()(features), expected, rtol=1e-4, atol=0)
+
+
+def test_whitening_is_finite_where_features_are_alike_or_more_than_samples():
+    whitening = Whitening(6)
+    for features in (th.ones(4, 6), th.zeros(4, 6), th.randn(4, 1).expand(4, 6), th.randn(3, 6)):
+        features = features.clone().requires_grad_()
+        white = whitening(features)
+        white.square().sum().backward()
+        assert white.isfinite().all() and features.grad.isfinite().all()
+
+
+def test_whitening_has_the_gradient_of_what_it_computes():
+    th.manual_seed(1)
+    assert th.autograd.gradcheck(Whitening(3).double(), th.randn(5, 3, dtype=th.float64, requires_grad=True))

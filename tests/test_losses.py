@@ -8,6 +8,7 @@ from sb3_contrib.common.utils import quantile_huber_loss as contrib_quantile_hub
 from sb3_eqr.common.losses import (
     categorical_loss,
     categorical_projection,
+    contrastive_loss,
     normalized_distance,
     quantile_huber_loss,
     reward_cross_entropy,
@@ -20,6 +21,19 @@ def test_normalized_distance_by_hand():
     b = th.tensor([[6.0, 8.0], [0.0, 5.0], [-1.0, 0.0], [1.0, 0.0]])
     # same direction, a right angle, opposite directions, no direction
     th.testing.assert_close(normalized_distance(a, b), th.tensor([0.0, 2.0, 4.0, 1.0]))
+
+
+def test_contrastive_loss_by_hand():
+    one, two = th.tensor([1.0, 0.0]), th.tensor([0.0, 3.0])
+    target = th.stack([one, two])[:, None]  # (2, 1, 2): a right angle apart
+    own, other, same = math.exp(1 / 0.2), math.exp(0.0), math.log(2)
+    found = contrastive_loss(5 * target, target)
+    th.testing.assert_close(found, th.full((2, 1), -math.log(own / (own + other))))
+    th.testing.assert_close(contrastive_loss(target.flip(0), target), th.full((2, 1), -math.log(other / (own + other))))
+    th.testing.assert_close(contrastive_loss(target, one.expand(2, 1, 2)), th.full((2, 1), same))  # a collapse: log B
+    # negatives are those of the same step
+    steps = th.cat([target, target.flip(0)], dim=1)  # (2, 2, 2)
+    th.testing.assert_close(contrastive_loss(steps, steps), th.full((2, 2), -math.log(own / (own + other))))
 
 
 def test_normalized_distance_has_finite_gradients_at_zero():

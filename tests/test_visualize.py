@@ -241,6 +241,8 @@ def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
     assert type(loaded) is EqRQRDQN
     found = loading.make_env(loaded, path)
     assert isinstance(found, VecNormalize) and found.obs_rms.mean[0] == 7 and not found.training and not found.norm_reward
+    seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
+    assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
     other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
     assert other.num_envs == 2
 

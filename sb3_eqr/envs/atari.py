@@ -27,6 +27,7 @@ def make_atari100k_env(
     vec_env_cls: Callable[..., VecEnv] = DummyVecEnv,
     vec_env_kwargs: dict[str, Any] | None = None,
     monitor_dir: str | None = None,
+    render_mode: str | None = None,
 ) -> VecEnv:
     """
     Atari as the paper trains on it: up to 30 no-ops, each action for 4 frames of which the last two are maximised, grey
@@ -40,6 +41,7 @@ def make_atari100k_env(
     :param vec_env_cls: ``DummyVecEnv`` or ``SubprocVecEnv``
     :param vec_env_kwargs: its keyword arguments
     :param monitor_dir: folder for ``Monitor``'s files
+    :param render_mode: ALE's: "rgb_array" for pictures in colour from ``render()``, "human" for a window
     :return: observations (84, 84, 4), uint8; SB3 transposes them
     :raises ImportError: without ale-py or OpenCV
     :raises ValueError: for a game that there is not, with the nearest names, or ``n_envs`` below 1
@@ -50,7 +52,9 @@ def make_atari100k_env(
 
     def make_game() -> gym.Env:
         # Sticky actions, frame skip and frame limit of ALE itself off: the wrappers do what the protocol says.
-        env = gym.make(env_id, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None)
+        env = gym.make(
+            env_id, render_mode=render_mode, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None
+        )
         return _in_agent_steps(env)
 
     env = make_vec_env(

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
@@ -12,6 +13,7 @@ from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixLieGroup, NoGroup, ProductGroup, T
+from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
 CHUNK = 256  # observations encoded at once
@@ -49,7 +51,7 @@ def play(
     model: EqRAlgorithm, env: VecEnv, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
 ) -> Play:
     """
-    Let the agent play, and cut the play into windows. NumPy's and torch's global generators are left as they were.
+    Let the agent play, and cut the play into windows. Every random generator but the environments' is left as it was.
 
     :param model: any EqR agent
     :param env: with the agent's observations and actions, preprocessed as in training
@@ -67,10 +69,11 @@ def play(
         n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
     )
     factors: list[np.ndarray | None] = []
-    state = th.get_rng_state(), np.random.get_state()
-    th.manual_seed(seed)
-    np.random.seed(seed)
+    spaces = (model.action_space, env.action_space)  # a random action is drawn from the first
+    states = [get_rng_state(space) for space in spaces]
     try:
+        set_random_seed(seed)
+        model.action_space.seed(seed)
         env.seed(seed)
         obs: Any = env.reset()
         infos: list[dict[str, Any]] = env.reset_infos
@@ -82,10 +85,10 @@ def play(
             infos = [env.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
             obs = new_obs
     finally:
-        th.set_rng_state(state[0])
-        np.random.set_state(state[1])
+        for state, space in zip(states, spaces, strict=True):
+            set_rng_state(state, space)
     starts, envs = (grid.ravel() for grid in np.meshgrid(np.arange(buffer.n_starts), np.arange(env.num_envs), indexing="ij"))
-    samples = buffer.windows(starts, envs, model.get_vec_normalize_env())
+    samples = buffer.windows(starts, envs)  # a VecNormalize has normalised them already
     known = all(found is not None for found in factors)
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
 

@@ -1,0 +1,155 @@
+"""Representation learning alone: no Q-learning, no reward, random actions; and the switches that it is made of."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.common.groups import make_group
+from sb3_eqr.common.latent_model import LatentModel
+from sb3_eqr.representation import train_representation
+from sb3_eqr.visualize.latents import coordinates, encode, split
+from tests.models import EITHER
+from tests.toys import ChainEnv
+
+STEPS = 12  # around the ring
+
+
+class Ring(gym.Env):
+    """A point on a ring, seen through a fixed random mixture of harmonics: no coordinate is the angle's sine or cosine."""
+
+    def __init__(self):
+        self.observation_space = spaces.Box(-np.inf, np.inf, (12,), np.float32)
+        self.action_space = spaces.Discrete(2)
+        mixing = np.random.default_rng(0).normal(size=(6, 12))
+        self.mixing = mixing / np.linalg.norm(mixing, axis=1, keepdims=True)
+        self.angle, self.time = 0.0, 0
+
+    def see(self, angle):
+        harmonics = np.concatenate([[np.cos(k * angle), np.sin(k * angle)] for k in (1, 2, 3)])
+        return (5 + harmonics @ self.mixing).astype(np.float32)  # a constant that dwarfs what changes
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.angle, self.time = self.np_random.uniform(0, 2 * np.pi), 0
+        return self.see(self.angle), {}
+
+    def step(self, action):
+        self.angle += 2 * np.pi / STEPS * (1 if action == 0 else -1)
+        self.time += 1
+        return self.see(self.angle), 1.0, False, self.time == 20, {}
+
+
+def train(seed, total_timesteps=900, **kwargs):
+    env = make_vec_env(Ring, 8, seed)
+    return train_representation(
+        env, "SO(2)", policy="MlpPolicy", total_timesteps=total_timesteps, seed=seed, device="cpu", **kwargs
+    )
+
+
+def angles(model):
+    places = np.arange(60) / 60 * 2 * np.pi
+    blocks = split(model, encode(model, th.as_tensor(np.stack([Ring().see(place) for place in places]))))[0]
+    return coordinates(blocks.group, blocks.elements)[:, 0, 0].numpy(), places
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_ring_is_found(seed):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        model = train(seed)
+    found, places = angles(model)
+    steps = np.angle(np.exp(1j * np.diff(found, append=found[0])))
+    turns = steps.sum() / (2 * np.pi)
+    assert abs(round(turns)) == 1  # one full turn, in one of the two directions
+    rest = np.angle(np.exp(1j * (found - turns * places)))
+    rest = np.angle(np.exp(1j * (rest - np.angle(np.exp(1j * rest).mean()))))
+    assert 1 - rest.var() / (np.pi**2 / 3) > 0.99
+    table = model.policy.latent_model.transition.weight.detach()[0] / (2 * np.pi / STEPS)  # angles of the actions, in steps
+    assert abs(table[0] + table[1]) < 0.02 and abs(abs(table[0]) - 1) < 0.05
+
+
+def test_the_example_as_stated_collapses_and_that_is_told():
+    with pytest.warns(UserWarning, match="states and actions are nearly constant.*collapsed"):
+        train(0, 1500, parameterization="euler", whiten=False, aet_loss="distance")
+
+
+def test_the_same_seed_gives_the_same_representation():
+    one, two = train(3, 560), train(3, 560)
+    for (name, value), other in zip(one.policy.state_dict().items(), two.policy.state_dict().values(), strict=True):
+        assert th.equal(value, other), name
+
+
+def test_without_q_learning_the_head_stays_and_nothing_of_it_is_logged(make):
+    model = make(ChainEnv(), td_coef=0.0, policy_kwargs={"projection": "own"})
+    head = [p.clone() for p in model.policy.online.head.parameters()]
+    encoder = [p.clone() for p in model.policy.online.features_extractor.parameters()]
+    model.learn(60)
+    assert all(th.equal(p, q) for p, q in zip(model.policy.online.head.parameters(), head, strict=True))
+    assert not any(th.equal(p, q) for p, q in zip(model.policy.online.features_extractor.parameters(), encoder, strict=True))
+    logged = model.logger.name_to_value
+    assert "train/aet_loss" in logged and "train/td_loss" not in logged and "train/mean_q_value" not in logged
+    assert model.replay_buffer._max_priority == 1.0  # no TD error: priorities stay
+
+
+def test_weight_of_the_td_loss(make):
+    """The loss is the sum of its parts with their weights."""
+    model = make(ChainEnv(), td_coef=0.5, aet_coef=2.0, prioritized_replay=False)
+    model.learn(41)
+    logged = {
+        name: model.logger.name_to_value[f"train/{name}"]
+        for name in ("loss", "td_loss", "aet_loss", "get_loss", "reward_loss")
+    }
+    expected = 0.5 * logged["td_loss"] + 2 * logged["aet_loss"] + logged["get_loss"] + logged["reward_loss"]
+    assert logged["loss"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_actions_that_do_not_depend_on_the_state():
+    model = LatentModel(make_group("SE(2)", "gram-schmidt"), 3, 4, state_dependent_actions=False)
+    states = th.randn(5, 27)
+    one_hot = th.eye(4)[[0, 1, 2, 3, 0]]
+    assert th.equal(model.action_element(states, one_hot), model.group.identity(5, 3))  # they start there
+    with th.no_grad():
+        model.transition.weight.normal_()
+    elements = model.action_element(states, one_hot)
+    assert th.equal(elements[0], elements[4]) and not th.equal(elements[0], elements[1])
+    assert th.equal(elements, model.action_element(th.randn(5, 27), one_hot))
+
+
+@EITHER
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"aet_loss": "contrastive"},
+        {"policy_kwargs": {"projection": "none"}},
+        {"policy_kwargs": {"whiten": True}},
+        {"policy_kwargs": {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}},
+        {"policy_kwargs": {"state_dependent_actions": False}, "aet_loss": "contrastive", "td_coef": 0.0, "get_coef": 0.0},
+        {"td_coef": 0.0, "aet_coef": 0.0},
+    ],
+    ids=str,
+)
+def test_the_switches_train_and_are_saved(make, settings, tmp_path):
+    model = make(ChainEnv(), **settings).learn(60)
+    model.save(tmp_path / "model")
+    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
+    assert loaded.aet_loss == model.aet_loss and loaded.td_coef == model.td_coef
+    for name, value in model.policy.state_dict().items():
+        assert th.equal(value, loaded.policy.state_dict()[name]), name
+    loaded.learn(60)
+
+
+def test_what_is_not_legal():
+    with pytest.raises(ValueError, match="aet_loss: expected one of .*contrastive.*found 'nce'"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), aet_loss="nce")
+    with pytest.raises(ValueError, match="projection: expected one of .*found 'mine'"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "mine"})
+    with pytest.raises(ValueError, match="td_coef: expected .*>= 0"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=-1)
+    with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)
