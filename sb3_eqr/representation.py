@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import LinearSchedule
+from torch import nn
 
 from sb3_eqr.common.groups import Group
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
@@ -17,11 +19,37 @@ INITIAL_LEARNING_RATE = 1e-3  # to 0, linearly: what is left at the end is the n
 N_WINDOWS = 512  # that are looked at for a collapse
 
 
+class StillActions(BaseCallback):
+    """
+    Lets κ begin at the identity, and stay there for a while.
+
+    :param until: so many steps of the environments
+    """
+
+    model: EqRQRDQN
+
+    def __init__(self, until: int):
+        super().__init__()
+        self.until = until
+
+    def _on_training_start(self) -> None:
+        *_, output = self.model.policy.latent_model.transition.children()
+        for parameter in output.parameters():
+            nn.init.zeros_(parameter)
+        self._on_rollout_start()
+
+    def _on_rollout_start(self) -> None:
+        self.model.policy.latent_model.transition.requires_grad_(self.num_timesteps >= self.until)
+
+    def _on_step(self) -> bool:
+        return True
+
+
 def train_representation(
     env: GymEnv | str,
     group: str | Group,
     n_blocks: int | None = 1,
-    total_timesteps: int = 2_000,
+    total_timesteps: int = 3_000,
     policy: str = "CnnPolicy",
     learning_rate: float | Schedule | None = None,
     learning_starts: int = 500,
@@ -32,6 +60,7 @@ def train_representation(
     parameterization: str = "gram-schmidt",
     whiten: bool = True,
     state_dependent_actions: bool = False,
+    still_timesteps: int = 500,
     policy_kwargs: dict[str, Any] | None = None,
     callback: MaybeCallback = None,
     progress_bar: bool = False,
@@ -43,9 +72,9 @@ def train_representation(
     τ and κ by the AET loss on random actions, without Q-learning and without rewards. What comes back is an ordinary agent
     (``td_coef=0``): ``save``, ``sb3-eqr visualize`` and ``load_representation`` take it; its Q head is as it was drawn.
 
-    The defaults are the least that found the sliding ball's circle with every seed (docs/representation.md): states that are
-    whitened and have no seam, actions that start at the identity, and the contrastive loss, without which two blocks may learn
-    the same. The paper's example as it is stated, ``aet_loss="distance", parameterization="euler", whiten=False``, collapses.
+    The defaults are the least that found the sliding ball's circle and torus (docs/representation.md): states that are
+    whitened and have no seam, actions that stay the identity at first, and the contrastive loss. The paper's example as it is
+    stated, ``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``, collapses.
 
     :param env: as for :class:`~sb3_eqr.EqRQRDQN`; several environments at once see more of the world
     :param group: of the blocks, see :func:`~sb3_eqr.common.groups.make_group`
@@ -61,6 +90,9 @@ def train_representation(
     :param parameterization: of rotations among the states
     :param whiten: whether states are whitened
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, which makes angles linear in what is moved
+    :param still_timesteps: how many steps after ``learning_starts`` actions stay the identity; 0: they start as drawn. Then what
+        changes slowly is learned first (slow feature analysis, Wiskott and Sejnowski 2002,
+        https://doi.org/10.1162/089976602317318938): one turn of a loop and not two, one axis and not a mixture
     :param policy_kwargs: what else the policy takes
     :param callback: as for ``learn``
     :param progress_bar: as for ``learn``
@@ -106,7 +138,10 @@ def train_representation(
         seed=seed,
         device=device,
     )
-    model.learn(total_timesteps, callback=callback, progress_bar=progress_bar)
+    given = [] if callback is None else callback if isinstance(callback, list) else [callback]
+    still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
+    callbacks = [*still, *(one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given)]
+    model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
         warnings.warn(

@@ -45,8 +45,9 @@ class Ring(gym.Env):
         return self.see(self.angle), 1.0, False, self.time == 20, {}
 
 
-def train(seed, total_timesteps=900, **kwargs):
+def train(seed, total_timesteps=1_200, **kwargs):
     env = make_vec_env(Ring, 8, seed)
+    kwargs = {"learning_starts": 200, "still_timesteps": 200, **kwargs}
     return train_representation(
         env, "SO(2)", policy="MlpPolicy", total_timesteps=total_timesteps, seed=seed, device="cpu", **kwargs
     )
@@ -70,13 +71,14 @@ def test_the_ring_is_found(seed):
     rest = np.angle(np.exp(1j * (found - turns * places)))
     rest = np.angle(np.exp(1j * (rest - np.angle(np.exp(1j * rest).mean()))))
     assert 1 - rest.var() / (np.pi**2 / 3) > 0.99
-    table = model.policy.latent_model.transition.weight.detach()[0] / (2 * np.pi / STEPS)  # angles of the actions, in steps
+    with th.no_grad():
+        table = model.policy.latent_model.transition(th.eye(2))[:, 0] / (2 * np.pi / STEPS)  # angles of the actions, in steps
     assert abs(table[0] + table[1]) < 0.02 and abs(abs(table[0]) - 1) < 0.05
 
 
 def test_the_example_as_stated_collapses_and_that_is_told():
     with pytest.warns(UserWarning, match="states and actions are nearly constant.*collapsed"):
-        train(0, 1500, parameterization="euler", whiten=False, aet_loss="distance")
+        train(0, 1500, parameterization="euler", whiten=False, aet_loss="distance", still_timesteps=0, learning_rate=1e-2)
 
 
 def test_the_same_seed_gives_the_same_representation():
@@ -113,9 +115,6 @@ def test_actions_that_do_not_depend_on_the_state():
     model = LatentModel(make_group("SE(2)", "gram-schmidt"), 3, 4, state_dependent_actions=False)
     states = th.randn(5, 27)
     one_hot = th.eye(4)[[0, 1, 2, 3, 0]]
-    assert th.equal(model.action_element(states, one_hot), model.group.identity(5, 3))  # they start there
-    with th.no_grad():
-        model.transition.weight.normal_()
     elements = model.action_element(states, one_hot)
     assert th.equal(elements[0], elements[4]) and not th.equal(elements[0], elements[1])
     assert th.equal(elements, model.action_element(th.randn(5, 27), one_hot))
@@ -145,11 +144,11 @@ def test_the_switches_train_and_are_saved(make, settings, tmp_path):
 
 
 def test_what_is_not_legal():
-    with pytest.raises(ValueError, match="aet_loss: expected one of .*contrastive.*found 'nce'"):
+    with pytest.raises(ValueError, match=r"aet_loss: expected one of .*contrastive.*found 'nce'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), aet_loss="nce")
-    with pytest.raises(ValueError, match="projection: expected one of .*found 'mine'"):
+    with pytest.raises(ValueError, match=r"projection: expected one of .*found 'mine'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "mine"})
-    with pytest.raises(ValueError, match="td_coef: expected .*>= 0"):
+    with pytest.raises(ValueError, match="td_coef: expected a finite number of at least 0"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=-1)
     with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)

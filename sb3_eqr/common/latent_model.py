@@ -59,11 +59,9 @@ class LatentModel(nn.Module):
         state_dim = n_blocks * prod(group.element_shape)
         algebra_dim = n_blocks * group.num_params
         self.state_dependent_actions = state_dependent_actions
-        self.transition: nn.Module = (  # κ
-            _hidden_layer(state_dim + n_actions, hidden_dim, algebra_dim)
-            if state_dependent_actions
-            else _action_table(n_actions, algebra_dim)
-        )
+        self.transition = _hidden_layer(state_dim * state_dependent_actions + n_actions, hidden_dim, algebra_dim)  # κ
+        if not state_dependent_actions:
+            self.transition[1] = nn.Identity()  # statistics of a batch of actions would move κ(a) with the draw
         self._aet_loss = AET_LOSSES[aet_loss]
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
         self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)  # r_ψ
@@ -178,13 +176,3 @@ class LatentModel(nn.Module):
 def _hidden_layer(n_in: int, n_hidden: int, n_out: int) -> nn.Sequential:
     """One hidden layer with batch norm and ReLU: κ, r_ψ and ρ alike (appendix B.4)."""
     return nn.Sequential(nn.Linear(n_in, n_hidden), nn.BatchNorm1d(n_hidden), nn.ReLU(), nn.Linear(n_hidden, n_out))
-
-
-def _action_table(n_actions: int, n_out: int) -> nn.Linear:
-    """
-    κ(a): numbers per action. They start at 0, the identity, and no layer makes them move faster than the encoder: what changes
-    slowly is learned first (slow feature analysis, Wiskott and Sejnowski 2002), one turn of a loop and not two.
-    """
-    table = nn.Linear(n_actions, n_out, bias=False)
-    nn.init.zeros_(table.weight)
-    return table

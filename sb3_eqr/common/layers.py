@@ -141,12 +141,14 @@ class Whitening(nn.Module):
 
     running_mean: th.Tensor  # (D,)
     running_covariance: th.Tensor  # (D, D)
+    running_count: th.Tensor  # batches so far
 
     def __init__(self, n_features: int, momentum: float = 0.1):
         super().__init__()
         self.momentum = momentum
         self.register_buffer("running_mean", th.zeros(n_features))
         self.register_buffer("running_covariance", th.eye(n_features))
+        self.register_buffer("running_count", th.zeros(()))
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
@@ -161,11 +163,12 @@ class Whitening(nn.Module):
             variances = th.diag(centred.square().mean(dim=0))
             covariance = th.lerp(centred.mT @ centred / n, variances, n_features / (n_features + n))
             with th.no_grad():
-                self.running_mean.lerp_(mean, self.momentum)
-                self.running_covariance.lerp_(covariance, self.momentum)
-        eye = th.eye(len(covariance), dtype=covariance.dtype, device=covariance.device)
-        smallest = 1e-5 * covariance.diagonal().mean() + 1e-10  # relative: untrained features differ by very little
-        factor, _ = th.linalg.cholesky_ex(covariance + smallest * eye)
+                self.running_count += 1
+                weight = (1 / self.running_count).clamp(min=self.momentum)  # the first batch counts whole
+                self.running_mean.lerp_(mean, weight)
+                self.running_covariance.lerp_(covariance, weight)
+        smallest = th.diag(1e-5 * covariance.diagonal() + 1e-12)  # relative: untrained features differ by very little
+        factor, _ = th.linalg.cholesky_ex(covariance + smallest)
         return th.linalg.solve_triangular(factor, (features - mean).mT, upper=False).mT
 
 

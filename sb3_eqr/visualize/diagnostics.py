@@ -20,7 +20,7 @@ from sb3_eqr.visualize.findings import (
     find_generators,
     find_motion,
 )
-from sb3_eqr.visualize.latents import Play, _eval_mode, action_elements, latents
+from sb3_eqr.visualize.latents import Play, action_elements, eval_mode, latents
 from sb3_eqr.visualize.measures import Rewards, Transition
 
 MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
@@ -63,7 +63,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     """
     data = latents(model, play.samples)
     project = model.policy.project
-    with th.no_grad(), _eval_mode(model):
+    with th.no_grad(), eval_mode(model):
         start, following, predicted = (
             F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)
         )

@@ -11,7 +11,7 @@ from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
 from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import measures
-from sb3_eqr.visualize.latents import Latents, _eval_mode, coordinate_names, coordinates, encode, frame, split
+from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, split
 
 DORMANT = 0.025  # Sokar et al. 2023, https://arxiv.org/abs/2302.12902
 
@@ -141,7 +141,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
     partner = np.empty(n, dtype=int)
     partner[order] = np.roll(order, 1)  # never itself
     state, other = (x.unflatten(1, (-1, *group.element_shape)) for x in (data.states, data.states[partner]))
-    with th.no_grad(), _eval_mode(model):
+    with th.no_grad(), eval_mode(model):
         symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
         params = latent_model.action_symmetry(symmetry.flatten(1))
         rho = group.element(params.unflatten(1, (-1, group.num_params)))

@@ -18,7 +18,7 @@ from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
 CHUNK = 256  # observations encoded at once
 # What an environment tells of its true state, under these keys of ``info``; the worlds of sb3_eqr.envs do.
-FACTOR_KEYS = ("position", "angle", "velocity", "translation")
+FACTOR_KEYS = ("position", "angle", "velocity", "rotation", "translation")
 
 
 class Play(NamedTuple):
@@ -76,13 +76,15 @@ def play(
         model.action_space.seed(seed)
         env.seed(seed)
         obs: Any = env.reset()
-        infos: list[dict[str, Any]] = env.reset_infos
+        infos: list[dict[str, Any]] = env.unwrapped.reset_infos
         for _ in range(buffer.buffer_size):
             factors.append(_factors(infos))
             actions, _ = model.predict(obs, deterministic=deterministic)  # type: ignore[arg-type]
             new_obs, rewards, dones, infos = env.step(actions)
             buffer.add(obs, _true_next(new_obs, dones, infos), actions, rewards, dones, infos)
-            infos = [env.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
+            infos = [
+                env.unwrapped.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))
+            ]
             obs = new_obs
     finally:
         for state, space in zip(states, spaces, strict=True):
@@ -118,7 +120,7 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """
     n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
     pieces = []
-    with th.no_grad(), _eval_mode(model):
+    with th.no_grad(), eval_mode(model):
         for start in range(0, n, CHUNK):
             piece = _map(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
             pieces.append(model.policy.online.features(piece))
@@ -138,7 +140,7 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     states = encode(model, samples.observations)
     following = encode(model, _map(samples.rollout_observations, lambda obs: obs.flatten(0, 1)))
     latent_model = model.policy.latent_model
-    with th.no_grad(), _eval_mode(model):
+    with th.no_grad(), eval_mode(model):
         one_hot = F.one_hot(actions, latent_model.n_actions).to(states.dtype)
         predicted = latent_model.rollout(states, one_hot, mask)
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
@@ -165,7 +167,7 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     latent_model = model.policy.latent_model
     n, n_actions = len(states), latent_model.n_actions
     one_hot = th.eye(n_actions, dtype=states.dtype, device=states.device).repeat(n, 1)  # (N * A, A)
-    with th.no_grad(), _eval_mode(model):
+    with th.no_grad(), eval_mode(model):
         return latent_model.action_element(states.repeat_interleave(n_actions, dim=0), one_hot).unflatten(0, (n, n_actions))
 
 
@@ -286,7 +288,7 @@ def _map(observations: PyTorchObs, function) -> Any:
     return function(observations)
 
 
-class _eval_mode:
+class eval_mode:
     """The policy in eval mode while this lasts, then as it was."""
 
     def __init__(self, model: EqRAlgorithm):

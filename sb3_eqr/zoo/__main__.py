@@ -36,10 +36,11 @@ DOWNLOADS = "rl-trained-agents"  # where enjoy looks, and puts what it downloads
 # What the extra brings.
 EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
-USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark}} ...
+USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
 
-Every command but benchmark takes RL Zoo's arguments: sb3-eqr train --help
+Every command but the last two takes RL Zoo's arguments: sb3-eqr train --help
 benchmark compares agents over games and seeds: sb3-eqr benchmark --help
+visualize shows what a saved agent has learned: sb3-eqr visualize --help
 push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
 
 
@@ -173,7 +174,8 @@ def main() -> None:
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in COMMANDS:
         fail(
-            f"expected one of {', '.join(COMMANDS)}, benchmark, found {command!r}.{nearest(command, [*COMMANDS, 'benchmark'])}"
+            f"expected one of {', '.join(COMMANDS)}, benchmark, visualize, found {command!r}."
+            f"{nearest(command, [*COMMANDS, 'benchmark', 'visualize'])}"
         )
     register()
     if command.endswith("_hub"):
