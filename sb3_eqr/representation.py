@@ -90,8 +90,8 @@ def train_representation(
     :param parameterization: of rotations among the states
     :param whiten: whether states are whitened
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, which makes angles linear in what is moved
-    :param still_timesteps: how many steps after ``learning_starts`` actions stay the identity; 0: they start as drawn. Then what
-        changes slowly is learned first (slow feature analysis, Wiskott and Sejnowski 2002,
+    :param still_timesteps: how many steps after ``learning_starts`` actions stay the identity; 0: they start as drawn. Then
+        what changes slowly is learned first (slow feature analysis, Wiskott and Sejnowski 2002,
         https://doi.org/10.1162/089976602317318938): one turn of a loop and not two, one axis and not a mixture
     :param policy_kwargs: what else the policy takes
     :param callback: as for ``learn``
