@@ -62,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=3_000, help="of random play")
+    parser.add_argument("--steps", type=int, default=5_500, help="of random play")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/affine_group"), help="folder")
     args = parser.parse_args()

@@ -74,7 +74,7 @@ def main() -> None:
     )
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS), help="of the blocks")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of everything random")
-    parser.add_argument("--steps", type=int, default=2_500, help="of random play")
+    parser.add_argument("--steps", type=int, default=5_500, help="of random play")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/pendulum.jsonl"), help="a line per run")
     args = parser.parse_args()
     register()

@@ -70,7 +70,6 @@ def run(goal: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[s
                 make_env(None, 16, seed),
                 states.pop("group"),
                 states.pop("n_blocks"),
-                total_timesteps=steps,
                 state_dependent_actions=states.pop("state_dependent_actions"),
                 seed=seed,
             ).save(donor)

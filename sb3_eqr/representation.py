@@ -49,10 +49,10 @@ def train_representation(
     env: GymEnv | str,
     group: str | Group,
     n_blocks: int | None = 1,
-    total_timesteps: int = 3_000,
+    total_timesteps: int = 5_500,
     policy: str = "CnnPolicy",
     learning_rate: float | Schedule | None = None,
-    learning_starts: int = 500,
+    learning_starts: int = 3_000,
     batch_size: int = 64,
     prediction_depth: int = 5,
     aet_loss: str = "contrastive",
@@ -82,7 +82,7 @@ def train_representation(
     :param total_timesteps: random steps, over all environments; one update per step after ``learning_starts``
     :param policy: "CnnPolicy", "MlpPolicy" or "MultiInputPolicy"
     :param learning_rate: ``None``: 10⁻³, linearly to 0
-    :param learning_starts: steps before the first update
+    :param learning_starts: steps before the first update: what is slow shows only where much of the world has been seen
     :param batch_size: windows per update; with the contrastive loss, one more than the negatives
     :param prediction_depth: M, how many steps ahead
     :param aet_loss: "contrastive" or "distance" (Eq. 18)
