@@ -8,11 +8,10 @@ from sb3_eqr.common.groups import (
     MatrixLieGroup,
     ProductGroup,
     T,
-    euler_rotation,
-    exp_rotation,
     guarded_inverse,
     make_group,
 )
+from sb3_eqr.common.rotations import euler_rotation, exp_rotation
 
 AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
 

@@ -213,8 +213,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         return self._gather(self._positions(starts), envs, env)
 
     def _positions(self, starts: np.ndarray) -> np.ndarray:
-        oldest = self.pos if self.full else 0
-        return (oldest + starts) % self.buffer_size
+        return (starts + (self.pos if self.full else 0)) % self.buffer_size  # from the oldest on
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
         env_indices = np.random.randint(0, self.n_envs, size=batch_inds.shape)
