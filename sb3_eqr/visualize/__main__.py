@@ -50,7 +50,6 @@ def run(args: argparse.Namespace) -> None:
     model = load_model(args.model, args.algo, args.device)
     env = make_env(model, args.model, args.env, parse_kwargs(args.env_kwargs), args.n_envs, args.seed, args.video)
     depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
-    model.action_space.seed(args.seed)  # ε-greedy actions are drawn from it
     played = play(model, env, args.steps, depth, args.deterministic, args.seed)
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
@@ -87,7 +86,7 @@ def write_video(model: EqRAlgorithm, env: VecEnv, folder: pathlib.Path, depth: i
     """
     from sb3_eqr.visualize.animation import record  # its libraries are needed for this alone
 
-    record(model, env, folder / "play", depth=depth, seed=args.seed)
+    record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
 
 
 def fail(message: str) -> NoReturn:
