@@ -102,7 +102,6 @@ def make_env(
     if normalize is not None:
         normalize.training = False
     env = model._wrap_env(env, monitor_wrapper=False)
-    env.reset_infos = env.unwrapped.reset_infos  # SB3's wrappers have a list of their own, and leave it empty
     try:
         check_for_correct_spaces(env, model.observation_space, model.action_space)
     except ValueError as error:

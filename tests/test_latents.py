@@ -1,0 +1,64 @@
+"""Play cut into windows: what the agent saw, as it saw it, beside the true state, and nothing left behind."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage
+
+import sb3_eqr.envs
+from sb3_eqr import EqRQRDQN
+from sb3_eqr.envs import SlidingBall, make_atari100k_env
+from sb3_eqr.visualize.latents import play
+from tests.toys import ChainEnv
+
+sb3_eqr.envs.register()
+BALL = {"group": "SO(2)", "n_blocks": 1, "parameterization": "gram-schmidt", "whiten": True}
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_pictures_come_with_their_true_positions(wrapped):
+    """Whatever wrapper is around, across the ends of episodes."""
+    env = make_vec_env("SlidingBall-v0", 2, env_kwargs={"max_episode_steps": 7})
+    env = VecTransposeImage(env) if wrapped else env
+    model = EqRQRDQN("CnnPolicy", env, buffer_size=100, policy_kwargs=BALL, device="cpu")
+    found = play(model, make_vec_env("SlidingBall-v0", 2, env_kwargs={"max_episode_steps": 7}), n_steps=60, depth=3)
+    assert found.factors.shape == (2 * 28, 1)
+    for picture, position in zip(found.samples.observations.numpy(), found.factors, strict=True):
+        assert np.array_equal(picture[0], SlidingBall().draw(position)[:, :, 0])
+    assert found.samples.mask.min() == 0  # windows that end with their episode
+
+
+def test_observations_are_normalised_once():
+    env = VecNormalize(make_vec_env(ChainEnv, 1), norm_reward=False)
+    model = EqRQRDQN("MlpPolicy", env, buffer_size=200, learning_starts=500, device="cpu", seed=0).learn(100)
+    env.training = False
+    found = play(model, env, n_steps=40, depth=2, deterministic=True, seed=3).samples.observations.numpy()
+    env.seed(3)
+    obs = [env.reset()]
+    for _ in range(5):
+        obs.append(env.step(model.predict(obs[-1], deterministic=True)[0])[0])
+    np.testing.assert_allclose(found[:5], np.concatenate(obs)[:5], rtol=1e-6)
+
+
+def test_the_same_seed_plays_the_same_and_nothing_is_left_behind():
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=200, device="cpu", seed=0)
+    env = make_vec_env(ChainEnv, 1, seed=0)
+    model.exploration_rate = 0.5  # random actions are drawn from the action space's own generator
+    th.manual_seed(5)
+    np.random.seed(5)
+    model.action_space.seed(5)
+    expected = [th.rand(3), np.random.rand(3), [model.action_space.sample() for _ in range(9)]]
+    th.manual_seed(5)
+    np.random.seed(5)
+    model.action_space.seed(5)
+    one, two = (play(model, env, n_steps=60, depth=2, seed=1).samples for _ in range(2))
+    assert th.equal(one.actions, two.actions) and th.equal(one.observations, two.observations)
+    assert th.equal(th.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
+    assert [model.action_space.sample() for _ in range(9)] == expected[2]
+
+
+def test_atari_can_be_shown_in_colour():
+    env = make_atari100k_env("Pong", seed=0, render_mode="rgb_array")
+    env.reset()
+    assert env.render().shape == (210, 160, 3)
