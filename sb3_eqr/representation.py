@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
+from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.groups import Group
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
@@ -103,6 +104,8 @@ def train_representation(
     :raises ValueError: for an argument out of its range
     :warns UserWarning: if the representation has collapsed (:func:`~sb3_eqr.visualize.diagnostics.find_verdict`)
     """
+    check_number("still_timesteps", still_timesteps, 0, whole=True)
+    check_number("total_timesteps", total_timesteps, learning_starts + still_timesteps + 1, whole=True)
     model = EqRQRDQN(
         policy,
         env,
@@ -142,6 +145,8 @@ def train_representation(
     still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
     callbacks = [*still, *(one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given)]
     model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
+    if model.replay_buffer is None or model.replay_buffer.n_starts < 1:
+        return model  # a callback has stopped it before there was a window
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
         warnings.warn(

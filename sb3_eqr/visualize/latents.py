@@ -102,9 +102,14 @@ def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> P
     :param model: an agent in training, with ``prediction_depth`` ≥ 1
     :param n_windows: N
     :param rng: draws them
+    :raises ValueError: if there is no window yet
     """
     buffer = model.replay_buffer
-    assert buffer is not None and buffer.prediction_depth > 0
+    if buffer is None or buffer.prediction_depth == 0 or buffer.n_starts < 1:
+        raise ValueError(
+            "replayed: expected a replay buffer that holds whole windows, found none. Train the agent first, "
+            "with prediction_depth >= 1; for an agent that was loaded, let it play (sb3_eqr.visualize.play)."
+        )
     starts = rng.integers(0, buffer.n_starts, n_windows)
     envs = rng.integers(0, buffer.n_envs, n_windows)
     return Play(buffer.windows(starts, envs, model.get_vec_normalize_env()), None)
