@@ -70,7 +70,7 @@ def main() -> None:
     register()
     env = make_vec_env("SlidingBallTorus-v0", 16, args.seed)
     group = MatrixLieGroup(GENERATORS)
-    model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, verbose=1)
+    model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, verbose=1, device="cpu")
     model.save(args.out / "model")  # the generators travel with it
 
     seen = play(model, make_vec_env("SlidingBallTorus-v0", 4, args.seed + 100), n_steps=1_200)

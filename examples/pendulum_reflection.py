@@ -44,8 +44,8 @@ def measure(model: EqRQRDQN, world: PixelPendulum, seed: int) -> dict[str, Any]:
     latent_model, group = model.policy.latent_model.eval(), model.policy.latent_model.group
     clockwise, other = th.eye(latent_model.n_actions)[[0, -1]][:, None].expand(-1, N_STATES, -1)  # opposite torques
     with th.no_grad():
-        symmetry = group.compose(latent_model._blocks(mirrored), group.inverse(latent_model._blocks(x)))  # τ_g
-        rho = latent_model._element(latent_model.action_symmetry(symmetry.flatten(1)))
+        symmetry = group.compose(latent_model.blocks(mirrored), group.inverse(latent_model.blocks(x)))  # τ_g
+        rho = latent_model.element(latent_model.action_symmetry(symmetry.flatten(1)))
         torque = latent_model.action_element(x, clockwise)
         by_rho = latent_model.act(group.compose(rho, torque), mirrored)
         without = latent_model.act(torque, mirrored)
@@ -91,6 +91,7 @@ def main() -> None:
                 get_coef=1.0,
                 state_dependent_actions=True,  # what a torque does to the angle depends on the velocity
                 seed=seed,
+                device="cpu",
             )
             env = make_vec_env("PixelPendulum-v0", 1, seed + 100, env_kwargs={"gravity": False})
             diagnostics = diagnose(model, play(model, env, n_steps=500))

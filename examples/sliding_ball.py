@@ -47,6 +47,7 @@ ARMS: dict[str, dict[str, Any]] = {
 IDS = {"ball": "SlidingBall-v0", "torus": "SlidingBallTorus-v0"}
 DIMENSIONS = {"ball": 1, "torus": 2}
 GRID = {"ball": 192, "torus": 48}  # positions per axis that the learned map is looked at
+AXES = ("vertical", "horizontal")
 STEPS_AHEAD = 20
 N_ENVS = 16  # at once: random play of one alone sees little of a torus
 WIDTH = 0.25  # of the ball, in loops
@@ -164,7 +165,7 @@ def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) ->
                     str(number), (1.18 * np.cos(angle), -1.18 * np.sin(angle)), ha="center", va="center", fontsize=7
                 )
             panel.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
-            panel.set_title(f"block {k}" + (f", moving along axis {axis}" if axes > 1 else ""), fontsize="small")
+            panel.set_title(f"block {k}" + (f", {AXES[axis]} motion" if axes > 1 else ""), fontsize="small")
     with atomic_write(path, "png") as file:
         figure.savefig(file, dpi=110)
     plt.close(figure)
@@ -174,7 +175,9 @@ def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> 
     """Train, save, measure, draw."""
     world = SlidingBall(dimensions=DIMENSIONS[world_name])
     env = make_vec_env(IDS[world_name], N_ENVS, seed)
-    model = train_representation(env, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, **ARMS[arm])
+    model = train_representation(
+        env, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, device="cpu", **ARMS[arm]
+    )
     name = f"{world_name}-{arm}-{seed}".replace(", ", "-").replace(" ", "_")
     model.save(out / name)
     result = {"world": world_name, "arm": arm, "seed": seed, "steps": steps, **measure(model, world, GRID[world_name])}

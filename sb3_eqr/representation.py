@@ -34,13 +34,19 @@ class StillActions(BaseCallback):
         self.until = until
 
     def _on_training_start(self) -> None:
-        *_, output = self.model.policy.latent_model.transition.children()
-        for parameter in output.parameters():
-            nn.init.zeros_(parameter)
-        self._on_rollout_start()
+        latent_model = self.model.policy.latent_model
+        *_, output = latent_model.transition.children()
+        assert isinstance(output, nn.Linear)
+        identity = latent_model.group.identity_params().repeat(latent_model.n_blocks)
+        with th.no_grad():
+            output.weight.zero_()
+            output.bias.copy_(identity)
 
     def _on_rollout_start(self) -> None:
         self.model.policy.latent_model.transition.requires_grad_(self.num_timesteps >= self.until)
+
+    def _on_training_end(self) -> None:
+        self.model.policy.latent_model.transition.requires_grad_(True)
 
     def _on_step(self) -> bool:
         return True
@@ -149,9 +155,10 @@ def train_representation(
         return model  # a callback has stopped it before there was a window
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
+        remedies = {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True}
         warnings.warn(
             f"train_representation: states and actions are nearly constant. {found.summary}. "
-            'Pass whiten=True, aet_loss="contrastive", or a group that the world\'s motion has.'
+            f"Pass {' or '.join(remedy for remedy, is_open in remedies.items() if is_open)}."
         )
     elif verbose > 0:
         print(found.summary)

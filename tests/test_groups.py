@@ -115,13 +115,28 @@ def test_gram_schmidt_has_no_seam_and_a_direction_at_zero():
     assert abs(th.remainder(steps + np.pi, 2 * np.pi).sub(np.pi).sum().item() - 2 * np.pi) < 1e-9  # and once around
 
 
-@pytest.mark.parametrize("name", ["SO(3)", "SE(2)", "SE(2)^2 x SO(3)", "T(2)", "GL(2)"])
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_gram_schmidt_where_columns_are_axes_or_depend_on_each_other(n):
+    group = make_group(f"SO({n})", "gram-schmidt")
+    axes = th.eye(n, dtype=th.float64)[: n - 1].reshape(1, -1) * th.tensor([2.0], dtype=th.float64)
+    twice = th.tensor([[0.3, -0.2, 0.7, 1.0][:n] * (n - 1)], dtype=th.float64)  # every column the same
+    for params in (axes, axes.flip(1), twice):
+        for dtype, close in ((th.float64, 1e-12), (th.float32, 1e-5)):
+            given = params.detach().to(dtype, copy=True).requires_grad_()
+            rotation = group.element(given)[0]
+            th.testing.assert_close(rotation @ rotation.mT, th.eye(n, dtype=dtype), rtol=0, atol=close)
+            assert abs(th.linalg.det(rotation).item() - 1) < close
+            rotation.square().sum().backward()
+            assert given.grad.isfinite().all()
+    assert th.autograd.gradcheck(group.element, axes.clone().requires_grad_())
+
+
+@pytest.mark.parametrize("name", ["SO(3)", "SE(2)", "SE(2)^2 x SO(3)", "T(2)", "GL(2)", "GL(2)^2 x SO(2)"])
 def test_actions_are_parameterized_around_the_identity(name):
     group = make_group(name, "gram-schmidt")
     actions = group.for_actions
     assert actions.element_shape == group.element_shape and actions.name == group.name
-    if name != "GL(2)":
-        assert th.equal(actions.element(th.zeros(2, actions.num_params)), group.identity(2))
+    assert th.equal(actions.element(actions.identity_params()), group.identity())
     assert make_group(name, "exp").for_actions.num_params == actions.num_params
 
 

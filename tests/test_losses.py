@@ -27,13 +27,19 @@ def test_contrastive_loss_by_hand():
     one, two = th.tensor([1.0, 0.0]), th.tensor([0.0, 3.0])
     target = th.stack([one, two])[:, None]  # (2, 1, 2): a right angle apart
     own, other, same = math.exp(1 / 0.2), math.exp(0.0), math.log(2)
-    found = contrastive_loss(5 * target, target)
+    every = th.ones(2, 1)
+    found = contrastive_loss(5 * target, target, every)
     th.testing.assert_close(found, th.full((2, 1), -math.log(own / (own + other))))
-    th.testing.assert_close(contrastive_loss(target.flip(0), target), th.full((2, 1), -math.log(other / (own + other))))
-    th.testing.assert_close(contrastive_loss(target, one.expand(2, 1, 2)), th.full((2, 1), same))  # a collapse: log B
+    th.testing.assert_close(contrastive_loss(target.flip(0), target, every), th.full((2, 1), -math.log(other / (own + other))))
+    th.testing.assert_close(contrastive_loss(target, one.expand(2, 1, 2), every), th.full((2, 1), same))  # a collapse: log B
     # negatives are those of the same step
     steps = th.cat([target, target.flip(0)], dim=1)  # (2, 2, 2)
-    th.testing.assert_close(contrastive_loss(steps, steps), th.full((2, 2), -math.log(own / (own + other))))
+    th.testing.assert_close(contrastive_loss(steps, steps, th.ones(2, 2)), th.full((2, 2), -math.log(own / (own + other))))
+    # what lies past the end of an episode is no negative; nothing that is said of it reaches the others
+    mask = th.tensor([[1.0], [0.0]])
+    masked = contrastive_loss(target, th.stack([one, 7 * one])[:, None], mask)
+    th.testing.assert_close(masked[0], th.zeros(1))
+    assert masked.isfinite().all()
 
 
 def test_normalized_distance_has_finite_gradients_at_zero():

@@ -152,3 +152,25 @@ def test_what_is_not_legal():
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=-1)
     with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)
+    with pytest.raises(ValueError, match="whiten: expected a group"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), get_coef=0, policy_kwargs={"group": None, "whiten": True})
+    with pytest.raises(ValueError, match=r"total_timesteps: .*3501, found 3000"):
+        train_representation(Ring(), "SO(2)", policy="MlpPolicy", total_timesteps=3_000)
+
+
+@pytest.mark.parametrize("group", ["GL(2)", "SE(2)", "GL(2) x SO(2)"])
+def test_actions_stay_the_identity_at_first_and_are_let_go(group):
+    found = []
+
+    def look(local, _):
+        latent_model = local["self"].policy.latent_model
+        elements = latent_model.action_element(th.zeros(2, latent_model.group.identity(1).numel()), th.eye(2))
+        is_identity = th.equal(elements, latent_model.group.identity(2, 1))
+        found.append((local["self"].num_timesteps, is_identity))
+        return True
+
+    env = make_vec_env(Ring, 8, 0)
+    settings = {"policy": "MlpPolicy", "learning_starts": 80, "still_timesteps": 80, "total_timesteps": 240, "device": "cpu"}
+    model = train_representation(env, group, callback=look, seed=0, **settings)
+    assert [steps for steps, still in found if still] == list(range(8, 169, 8)) and not found[-1][1]
+    assert all(parameter.requires_grad for parameter in model.policy.latent_model.transition.parameters())

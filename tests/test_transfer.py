@@ -82,15 +82,33 @@ def test_another_kind_of_file(tmp_path):
     from sb3_contrib import QRDQN as Stock
 
     Stock("MlpPolicy", ChainEnv(), device="cpu").save(tmp_path / "stock")
-    with pytest.raises(ValueError, match="load_representation: expected"):
+    with pytest.raises(ValueError, match="expected a file of EqRQRDQN or EqRRainbow"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "stock")
     for algorithm in (EqRQRDQN, EqRRainbow):
         with pytest.raises(FileNotFoundError):
             algorithm("MlpPolicy", ChainEnv(), device="cpu").load_representation(tmp_path / "nothing")
 
 
-def test_a_representation_helps_its_own_task(tmp_path):
-    """The states of another agent are the same, to the bit, wherever they are computed."""
+def test_what_was_frozen_can_be_let_go(make, tmp_path):
+    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60).save(tmp_path / "old")
+    model = make(ChainEnv(), policy_kwargs=WHITENED).load_representation(tmp_path / "old", freeze=True).learn(45)
+    before = states(model)
+    model.load_representation(tmp_path / "old", freeze=False)
+    assert same(before, states(model)) and not model.representation_frozen
+    model.learn(60)
+    assert not same(before, states(model))
+
+
+def test_files_that_are_no_agents(tmp_path):
+    (tmp_path / "cut.zip").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="expected a whole file"):
+        QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
+    with pytest.raises(ValueError, match="freeze: expected a loss"):
+        QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
+
+
+def test_states_are_the_same_in_another_agent(tmp_path):
+    """To the bit, wherever they are computed."""
     old = QRDQN(ChainEnv(), seed=1).learn(60)
     old.save(tmp_path / "old")
     new = RAINBOW(ChainEnv(), seed=5).load_representation(tmp_path / "old")

@@ -267,10 +267,14 @@ class EqRAlgorithm(EqRSetup):
         :return: this agent
         :raises ValueError: if it does not fit: another group, trunk or number of actions; nothing is changed then
         """
+        if freeze and self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):
+            raise ValueError(
+                "freeze: expected a loss that trains something else, found td_coef=0 and no reward loss. Pass freeze=False."
+            )
+        self._collect_metrics()
         load_representation(self.policy, path)
         self.representation_frozen = freeze
-        if freeze:
-            self.policy.freeze(list(representation(self.policy).values()))
+        self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)  # no way back to before
         return self
 

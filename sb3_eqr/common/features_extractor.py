@@ -147,7 +147,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         ("SE(2)^8 x SO(3)^4", "none")
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether the algebra parameters are whitened over the batch (:class:`~sb3_eqr.common.layers.Whitening`), so
-        that states cannot collapse to a point, nor all blocks to the same
+        that states cannot collapse to a point, and blocks are driven apart
     :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments

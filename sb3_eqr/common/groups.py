@@ -80,6 +80,12 @@ class Group(ABC):
         """
         return self
 
+    def identity_params(self) -> th.Tensor:
+        """
+        :return: parameters of the identity, (num_params,)
+        """
+        return th.zeros(self.num_params)
+
 
 class MatrixGroup(Group):
     """Matrices under multiplication; the base of GL, SE, SO and of groups given by generators."""
@@ -127,6 +133,9 @@ class GL(MatrixGroup):
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return params.unflatten(-1, self.element_shape)
+
+    def identity_params(self) -> th.Tensor:
+        return th.eye(self.element_shape[0]).flatten()
 
 
 class SO(MatrixGroup):
@@ -217,6 +226,9 @@ class NoGroup(Group):
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         raise ValueError('group "none" has no identity: choose a group such as "SE(2)"')
 
+    def identity_params(self) -> th.Tensor:
+        return self.identity()
+
 
 class MatrixLieGroup(MatrixGroup):
     """
@@ -280,6 +292,9 @@ class ProductGroup(Group):
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         return self._flatten(group.identity(*batch, n, dtype=dtype, device=device) for group, n in self.factors)
+
+    def identity_params(self) -> th.Tensor:
+        return th.cat([group.identity_params().repeat(count) for group, count in self.factors])
 
     @property
     def for_actions(self) -> Group:

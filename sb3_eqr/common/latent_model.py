@@ -20,8 +20,11 @@ Projection = Callable[[th.Tensor], th.Tensor]
 
 # name -> (outputs of the reward network, loss)
 REWARD_LOSSES = {"mse": (1, reward_mse), "categorical": (3, reward_cross_entropy)}
-# name -> loss of (B, M, P) predictions and targets, (B, M)
-AET_LOSSES = {"distance": normalized_distance, "contrastive": contrastive_loss}
+# name -> loss of predictions and targets, (B, M, P), and the mask, (B, M)
+AET_LOSSES: dict[str, Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]] = {
+    "distance": lambda prediction, target, mask: normalized_distance(prediction, target),
+    "contrastive": contrastive_loss,
+}
 
 
 class LatentModel(nn.Module):
@@ -101,7 +104,7 @@ class LatentModel(nn.Module):
         if project is not None:
             with th.no_grad():
                 target_projected = target_project(target_states[:, 1:])  # (B, M, P)
-            aet = (self._aet_loss(project(predicted), target_projected) * mask).sum(dim=1)
+            aet = (self._aet_loss(project(predicted), target_projected, mask) * mask).sum(dim=1)
         if target is not None:
             get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
         if rewards is not None:
@@ -134,7 +137,7 @@ class LatentModel(nn.Module):
         :return: K group elements, (B, K, *element_shape)
         """
         inputs = th.cat([state, one_hot], dim=1) if self.state_dependent_actions else one_hot
-        return self._element(self.transition(inputs))
+        return self.element(self.transition(inputs))
 
     def act(self, elements: th.Tensor, state: th.Tensor) -> th.Tensor:
         """
@@ -142,7 +145,7 @@ class LatentModel(nn.Module):
         :param state: (B, D)
         :return: elements · state, (B, D)
         """
-        return self.group.compose(elements, self._blocks(state)).flatten(1)
+        return self.group.compose(elements, self.blocks(state)).flatten(1)
 
     def _symmetry_loss(
         self, state: th.Tensor, predicted: th.Tensor, one_hot: th.Tensor, target_state: th.Tensor, target: "LatentModel"
@@ -158,18 +161,26 @@ class LatentModel(nn.Module):
         """
         partner = target_state[th.randint(len(state), (len(state),), device=state.device)]  # x̄_j of Algorithm 1
         with th.no_grad():  # τ_g carries no gradient, as in the authors' code
-            inverse = self.group.inverse(self._blocks(state))
-            symmetry = self.group.compose(self._blocks(partner), inverse)  # τ_g, (B, K, ...)
+            inverse = self.group.inverse(self.blocks(state))
+            symmetry = self.group.compose(self.blocks(partner), inverse)  # τ_g, (B, K, ...)
             target_action = target.action_element(state, one_hot)  # κ̄, (B, K, ...)
         moved_prediction = self.act(symmetry, predicted)
-        action_map = self._element(self.action_symmetry(symmetry.flatten(1)))  # ρ(τ_g), (B, K, ...)
+        action_map = self.element(self.action_symmetry(symmetry.flatten(1)))  # ρ(τ_g), (B, K, ...)
         moved_partner = self.act(self.group.compose(action_map, target_action), partner)
         return normalized_distance(self.projection(moved_prediction), target.projection(moved_partner))
 
-    def _blocks(self, state: th.Tensor) -> th.Tensor:
+    def blocks(self, state: th.Tensor) -> th.Tensor:
+        """
+        :param state: (B, D)
+        :return: (B, K, *element_shape)
+        """
         return state.unflatten(1, (self.n_blocks, *self.group.element_shape))  # (B, K, *element_shape)
 
-    def _element(self, params: th.Tensor) -> th.Tensor:
+    def element(self, params: th.Tensor) -> th.Tensor:
+        """
+        :param params: (B, K * num_params)
+        :return: (B, K, *element_shape)
+        """
         return self.group.element(params.unflatten(1, (self.n_blocks, self.group.num_params)))
 
 

@@ -132,8 +132,9 @@ class Whitening(nn.Module):
     """
     Batch norm that looks at all features at once: mean 0, variance 1 and no correlation over the batch, by the Cholesky factor
     of the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). Without scale and offset, so that a collapse
-    to a point, or of several features to one, is out of reach. A batch of B samples tells the covariance of D features only
-    so well: D / (D + B) of each correlation is not believed. In eval mode the statistics are running means.
+    to a point is out of reach. A batch of B samples tells the covariance of D features only so well, so D / (D + B) of each
+    correlation is not believed and stays: a feature that others explain keeps a variance of about that share of its own, not
+    1. In eval mode the statistics are running means.
 
     :param n_features: D
     :param momentum: of the running means, as in PyTorch's batch norm

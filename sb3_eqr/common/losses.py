@@ -19,7 +19,7 @@ def normalized_distance(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
 TEMPERATURE = 0.2  # of contrastive_loss; 0.07 to 0.5 are in use, smaller ones look at the nearest negatives only
 
 
-def contrastive_loss(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
+def contrastive_loss(prediction: th.Tensor, target: th.Tensor, mask: th.Tensor) -> th.Tensor:
     """
     InfoNCE (van den Oord et al. 2018, Eq. 4, https://arxiv.org/abs/1807.03748): the cross-entropy of finding a prediction's
     own target among those of the batch at the same step, by the cosine of their angle over ``TEMPERATURE``. A constant
@@ -27,11 +27,14 @@ def contrastive_loss(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
 
     :param prediction: (B, M, P)
     :param target: (B, M, P)
-    :return: (B, M), > 0
+    :param mask: (B, M); where it is 0, a target is no other's negative
+    :return: (B, M), ≥ 0
     """
     cosines = th.einsum("bmp,nmp->bnm", F.normalize(prediction, dim=-1), F.normalize(target, dim=-1))  # (B, B, M)
-    own = th.arange(len(prediction), device=prediction.device)[:, None].expand(prediction.shape[:2])  # (B, M)
-    return F.cross_entropy(cosines / TEMPERATURE, own, reduction="none")
+    own = th.arange(len(prediction), device=prediction.device)  # (B,)
+    counts = (mask > 0) | (own[:, None, None] == own[:, None])  # (B, B, M): its own target counts in any case
+    logits = (cosines / TEMPERATURE).masked_fill(~counts, -th.inf)
+    return F.cross_entropy(logits, own[:, None].expand(mask.shape), reduction="none")
 
 
 def quantile_huber_loss(current: th.Tensor, target: th.Tensor) -> th.Tensor:

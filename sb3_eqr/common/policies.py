@@ -55,8 +55,8 @@ class EqRPolicy(BasePolicy):
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
-    :param whiten: whether the encoder's algebra parameters are whitened over the batch: neither can states collapse to a point
-        then, nor all blocks to the same
+    :param whiten: whether the encoder's algebra parameters are whitened over the batch: states cannot collapse to a point, and
+        blocks are driven apart; needs a group
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
@@ -117,6 +117,8 @@ class EqRPolicy(BasePolicy):
             )
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         check_number("sigma_init", sigma_init, 0)
+        if whiten and group is None:
+            raise ValueError("whiten: expected a group, whose parameters are whitened, found group=None. Pass whiten=False.")
         if projection not in PROJECTIONS:
             raise ValueError(f"projection: expected one of {list(PROJECTIONS)}, found {projection!r}")
         self.group = group
@@ -298,13 +300,15 @@ class EqRPolicy(BasePolicy):
 
     def freeze(self, modules: list[nn.Module]) -> None:
         """
-        Leave modules as they are from now on: parameters and batch statistics.
+        Leave modules as they are from now on, parameters and batch statistics; those of an earlier call are let go.
 
         :param modules: parts of this policy
         """
-        self._frozen = modules
+        for module in self._frozen:
+            module.requires_grad_(True).train(self.training)
         for module in modules:
             module.requires_grad_(False).eval()
+        self._frozen = modules
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

@@ -56,22 +56,35 @@ def gram_schmidt_rotation(params: th.Tensor, n: int) -> th.Tensor:
     (Zhou et al. 2019, §4, https://arxiv.org/abs/1812.07035). Unlike angles, these numbers need not jump where a state comes
     round to where it was: a continuous map from a loop to the real line cannot wind around a circle.
 
-    :param params: the columns one by one, (..., n(n-1)); all 0 is the identity
+    :param params: the columns one by one, (..., n(n-1)); all 0 is the identity. A column that depends on those before it gives
+        way to the axis that depends on them least
     :return: (..., n, n)
     """
-    eye = th.eye(n, dtype=params.dtype, device=params.device)
-    # A trace of the identity, so that a vector of zeros has a direction; lost in the rounding of any other.
-    raw = params.unflatten(-1, (n - 1, n)) + th.finfo(params.dtype).tiny ** 0.25 * eye[: n - 1]  # (..., n - 1, n)
-    columns: list[th.Tensor] = []
-    for column in raw.unbind(-2):
-        for found in columns:
-            column = column - (column * found).sum(-1, keepdim=True) * found
-        columns.append(F.normalize(column, dim=-1, eps=th.finfo(params.dtype).tiny))
-    known = th.stack(columns, dim=-1) if columns else params.new_empty(*params.shape[:-1], n, 0)  # (..., n, n - 1)
-    rows = th.tensor([[k for k in range(n) if k != i] for i in range(n)], dtype=th.long, device=params.device)  # (n, n - 1)
-    signs = th.tensor([(-1.0) ** (i + n - 1) for i in range(n)], dtype=params.dtype, device=params.device)
-    last = signs * th.linalg.det(known[..., rows, :])  # (..., n): the cofactors of the last column
-    return th.cat([known, last[..., None]], dim=-1)
+    found = params.new_empty(*params.shape[:-1], n, 0)  # (..., n, columns so far)
+    for raw in params.unflatten(-1, (n - 1, n)).unbind(-2):
+        column = _without(found, _without(found, raw))  # twice: once leaves rounding errors as large as what is left
+        dependent = column.norm(dim=-1) <= n * _ROUNDING * th.finfo(params.dtype).eps * raw.detach().norm(dim=-1)
+        column = th.where(dependent[..., None], _free_axis(found), column)
+        found = th.cat([found, F.normalize(column, dim=-1)[..., None]], dim=-1)
+    last = F.normalize(_free_axis(found), dim=-1)[..., None]
+    orientation = th.linalg.det(th.cat([found, last], dim=-1).detach()).sign()[..., None, None]
+    return th.cat([found, orientation * last], dim=-1)
+
+
+_ROUNDING = 10.0  # machine epsilons that two rounds of subtracting may leave of a column of length 1
+
+
+def _without(columns: th.Tensor, vector: th.Tensor) -> th.Tensor:
+    """What of a vector, (..., n), is orthogonal to orthonormal columns, (..., n, k)."""
+    return vector - (columns @ (columns.mT @ vector[..., None])).squeeze(-1)
+
+
+def _free_axis(columns: th.Tensor) -> th.Tensor:
+    """Of the axes the one with the longest part orthogonal to orthonormal columns, (..., n, k): that part, (..., n)."""
+    eye = th.eye(columns.shape[-2], dtype=columns.dtype, device=columns.device)
+    free = eye - columns @ columns.mT  # (..., n, n): its columns are those parts, its diagonal their squared lengths
+    longest = free.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1)  # (...)
+    return (free @ eye[longest][..., None]).squeeze(-1)
 
 
 # name -> (how many numbers make a rotation of n-space, the rotation that they make)

@@ -10,6 +10,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
 from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.safe_files import is_whole_model
 
 ENCODER = "features_extractor"
 LATENT_PARTS = ("transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
@@ -23,13 +24,7 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
     :param path: a file of either agent
     :raises ValueError: if the file holds no EqR agent, or one of another group, trunk or number of actions
     """
-    _, saved, _ = load_from_zip_file(path, device=policy.device)  # type: ignore[arg-type]
-    parameters: Any = (saved or {}).get("policy", {})
-    found: dict[str, dict[str, th.Tensor]] = {name: {} for name in (ENCODER, *LATENT_PARTS)}
-    for name, value in parameters.items():
-        match = re.fullmatch(rf"(?:(?!\w+_target\.)\w+\.{ENCODER}|latent_model\.(\w+))\.(.+)", name)
-        if match and (match[1] or ENCODER) in found:
-            found[match[1] or ENCODER][match[2]] = value
+    found = _saved_parts(path, policy.device)
     modules = representation(policy)
     for name, module in modules.items():
         expected = {key: _kind(value) for key, value in module.state_dict().items()}
@@ -57,6 +52,28 @@ def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
     :return: the encoder and the parts of the latent model that do not depend on rewards
     """
     return {ENCODER: policy.online.features_extractor} | {name: getattr(policy.latent_model, name) for name in LATENT_PARTS}
+
+
+def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device) -> dict[str, dict[str, th.Tensor]]:
+    """
+    :return: the parameters of each part of the representation in a file
+    """
+    if isinstance(path, (str, pathlib.Path)):
+        found_file = next((file for file in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if file.is_file()), None)
+        if found_file is not None and not is_whole_model(found_file):
+            raise ValueError(
+                f"load_representation: expected a whole file of an agent's save, found one that is cut off: {path}."
+            )
+    _, saved, _ = load_from_zip_file(path, load_data=False, device=device)  # type: ignore[arg-type]
+    parameters: Any = (saved or {}).get("policy", {})
+    if not any(name.startswith("latent_model.") for name in parameters):
+        raise ValueError(f"load_representation: expected a file of EqRQRDQN or EqRRainbow, found another in {path}.")
+    found: dict[str, dict[str, th.Tensor]] = {name: {} for name in (ENCODER, *LATENT_PARTS)}
+    for name, value in parameters.items():
+        match = re.fullmatch(rf"(?:(?!\w+_target\.)\w+\.{ENCODER}|latent_model\.(\w+))\.(.+)", name)
+        if match and (match[1] or ENCODER) in found:
+            found[match[1] or ENCODER][match[2]] = value
+    return found
 
 
 def _kind(value: th.Tensor) -> str:

@@ -11,6 +11,7 @@ import torch as th
 from PIL import Image
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from torch.nn import functional as F
 
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -18,7 +19,7 @@ from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.safe_files import atomic_write, get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
-from sb3_eqr.visualize.latents import action_elements, encode
+from sb3_eqr.visualize.latents import encode, eval_mode
 from sb3_eqr.visualize.loading import action_names
 from sb3_eqr.visualize.pixels import observed_pictures
 from sb3_eqr.visualize.sketches import panels
@@ -149,10 +150,11 @@ def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, sta
     :return: x̂_M for each step, (T, D); NaN where the episode was not that old
     """
     n = len(states) - depth
-    predicted, rows = states[:n], th.arange(n)
-    for m in range(depth):
-        moves = action_elements(model, predicted)[rows, th.as_tensor(actions[m : m + n])]
-        predicted = model.policy.latent_model.act(moves, predicted)
+    latent_model = model.policy.latent_model
+    since = th.as_tensor(np.lib.stride_tricks.sliding_window_view(actions, depth)[:n].copy(), device=states.device)  # (n, M)
+    with th.no_grad(), eval_mode(model):
+        one_hot = F.one_hot(since, latent_model.n_actions).to(states.dtype)
+        predicted = latent_model.rollout(states[:n], one_hot, th.ones_like(one_hot[..., 0]))[:, -1]
     old_enough = th.as_tensor(np.arange(depth, len(states)) - starts[depth:] >= depth, device=states.device)
     nothing = th.full_like(states, float("nan"))
     return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])
@@ -195,7 +197,7 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
         movie = None
         if "mp4" in formats:
             movie = _open_movie(files["mp4"].name, fps)
-            stack.callback(movie.close)  # before the file takes its place
+            stack.callback(_close_movie, movie, files["mp4"].name)  # before the file takes its place
         kept = []
         for t, image in enumerate(images):
             if movie is not None:
@@ -218,6 +220,14 @@ def _open_movie(path: str, fps: float) -> Generator[None, np.ndarray | None, Non
     )
     movie.send(None)  # starts
     return movie
+
+
+def _close_movie(movie: Generator, path: str) -> None:
+    """imageio does not look at how ffmpeg ended: a movie that cannot be read again must not replace a good one."""
+    movie.close()
+    from imageio_ffmpeg import count_frames_and_secs
+
+    count_frames_and_secs(path)  # raises where there is no whole movie
 
 
 def _write_gif(images: list[Image.Image], file: BinaryIO, fps: float) -> None:

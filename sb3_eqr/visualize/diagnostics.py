@@ -68,7 +68,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
             F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)
         )
     chosen = th.linspace(0, len(data.states) - 1, min(len(data.states), MAX_STATES)).long().to(data.states.device)
-    elements = action_elements(model, data.states[chosen])  # (n, A, K, ...)
+    elements = action_elements(model, data.states[chosen])  # (n, A, D)
     motion = find_motion(model, data, data.states[chosen], elements)
     generators = find_generators(model, elements)
     loss = measures.transition_error(start, following, predicted, data.mask)

@@ -70,12 +70,12 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
     transition's error.
 
     :param states: (n, D)
-    :param elements: κ of every action there, (n, A, K, ...)
+    :param elements: κ of every action there, (n, A, D)
     """
     latent_model = model.policy.latent_model
     n_actions = latent_model.n_actions
     before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
-    moved = latent_model.act(elements.flatten(0, 1), before)
+    moved = latent_model.act(latent_model.blocks(elements.flatten(0, 1)), before)
     predicted = _block_norms(model, moved - before).unflatten(0, (-1, n_actions)).mean(dim=0)  # (A, K)
     steps = _block_norms(model, data.next_states[:, 0] - data.states)  # (N, K)
     played = F.one_hot(data.actions[:, 0], n_actions).to(steps.dtype)  # (N, A)
@@ -85,7 +85,7 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
 
 def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators]:
     """
-    :param elements: κ of every action in n states, (n, A, K, ...)
+    :param elements: κ of every action in n states, (n, A, D)
     """
     found = []
     for group, blocks in split(model, elements):

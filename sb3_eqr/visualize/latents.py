@@ -167,26 +167,24 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     κ(x, a) of every action in every state.
 
     :param states: (N, D)
-    :return: (N, A, K, *element_shape), without gradient
+    :return: flat, as states are, (N, A, D), without gradient
     """
     latent_model = model.policy.latent_model
     n, n_actions = len(states), latent_model.n_actions
     one_hot = th.eye(n_actions, dtype=states.dtype, device=states.device).repeat(n, 1)  # (N * A, A)
     with th.no_grad(), eval_mode(model):
-        return latent_model.action_element(states.repeat_interleave(n_actions, dim=0), one_hot).unflatten(0, (n, n_actions))
+        elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), one_hot)
+    return elements.flatten(1).unflatten(0, (n, n_actions))
 
 
 def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
     """
-    :param states: flat, (..., D), or elements, (..., K, *element_shape)
+    :param states: or actions' elements, (..., D)
     :return: the blocks, one entry per group: a product's factors one by one
     """
     latent_model = model.policy.latent_model
-    group, shape = latent_model.group, latent_model.group.element_shape
-    if states.ndim > len(shape) and states.shape[-len(shape) - 1 :] == (latent_model.n_blocks, *shape):
-        elements = states
-    else:
-        elements = states.unflatten(-1, (latent_model.n_blocks, *shape))
+    group = latent_model.group
+    elements = states.unflatten(-1, (latent_model.n_blocks, *group.element_shape))
     if not isinstance(group, ProductGroup):
         return [Blocks(group, elements)]
     sizes = [count * prod(factor.element_shape) for factor, count in group.factors]
@@ -250,12 +248,16 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
     :param rotation: (..., n, n)
     :return: the upper triangle of its logarithm, (..., n(n-1)/2)
     """
-    if rotation.shape[-1] == 2:
+    n, dtype = rotation.shape[-1], rotation.dtype
+    if n == 2:
         return th.atan2(rotation[..., 0, 1] - rotation[..., 1, 0], rotation[..., 0, 0] + rotation[..., 1, 1])[..., None]
-    values, vectors = th.linalg.eig(rotation.to(th.float64))  # a rotation is normal: its eigenvectors are a basis
+    rotation = rotation.to(th.float64)
+    # A half turn has -1 twice, which says nothing of its plane: 10⁻⁷ rad about an odd axis tell the two apart.
+    aside = 1e-7 * th.linspace(0.5, 1, n * n, dtype=th.float64, device=rotation.device).sqrt().view(n, n).triu(1)
+    values, vectors = th.linalg.eig(rotation @ th.matrix_exp(aside - aside.mT))  # a rotation is normal: these are a basis
     log = (vectors * (1j * values.angle())[..., None, :] @ th.linalg.inv(vectors)).real
-    i, j = th.triu_indices(rotation.shape[-1], rotation.shape[-1], 1)
-    return log[..., i, j].to(rotation.dtype)
+    i, j = th.triu_indices(n, n, 1)
+    return log[..., i, j].to(dtype)
 
 
 def _is_affine(group: Group) -> bool:
