@@ -18,6 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_eqr import EqRQRDQN, MatrixLieGroup
 from sb3_eqr.envs import register
 from sb3_eqr.representation import train_representation
+from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import action_elements, coordinate_names, coordinates, encode, frame, play, split
 
 matplotlib.use("Agg")
@@ -42,13 +43,13 @@ def draw(model: EqRQRDQN, states: th.Tensor, positions: np.ndarray, path: pathli
     moves = split(model, action_elements(model, states[:1]))[0]  # κ(a), (1, A, K, 3, 3)
     turned, moved = frame(moves.group, moves.elements)
     assert linear is not None and shift is not None and turned is not None and moved is not None
-    figure, panels = plt.subplots(N_BLOCKS, 3, figsize=(10, 3.3 * N_BLOCKS), layout="constrained", squeeze=False)
+    figure, panels = plt.subplots(N_BLOCKS, 3, figsize=(11, 3.3 * N_BLOCKS), layout="constrained", squeeze=False)
     for k, row in enumerate(panels):
         row[0].plot(*SQUARE, color="0.6", linestyle=":", label="a square")
         for a, name in enumerate(ACTIONS):
             row[0].plot(*(turned[0, a, k].numpy() @ SQUARE + moved[0, a, k].numpy()[:, None]), label=name)
         row[0].set(title=f"block {k}: what actions do", aspect="equal")
-        row[0].legend(fontsize="x-small", loc="upper right")
+        row[0].legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         for panel, axis in zip(row[1:], ("vertical", "horizontal"), strict=True):
             colours = positions[:, int(axis == "horizontal")]
             shown = panel.scatter(*shift[:, k].numpy().T, c=colours, cmap="twilight", s=6)
@@ -70,10 +71,11 @@ def main() -> None:
     register()
     env = make_vec_env("SlidingBallTorus-v0", 16, args.seed)
     group = MatrixLieGroup(GENERATORS)
-    model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, verbose=1, device="cpu")
+    model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, device="cpu")
     model.save(args.out / "model")  # the generators travel with it
 
     seen = play(model, make_vec_env("SlidingBallTorus-v0", 4, args.seed + 100), n_steps=1_200)
+    print(diagnose(model, seen).summary)
     states = encode(model, seen.samples.observations)
     moves = split(model, action_elements(model, states[:1]))[0]
     table = pd.DataFrame(

@@ -93,6 +93,23 @@ def run(goal: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[s
     }
 
 
+def table(results: list[dict[str, Any]]) -> str:
+    """
+    :return: Markdown: per arm, mean and standard deviation over seeds; the last column is paired by seed
+    """
+    rows = ["| goal | start | seeds | mean of all evaluations | last three | more than from scratch |", "|---" * 6 + "|"]
+    areas = {(run["goal"], run["arm"], run["seed"]): run["area"] for run in results}
+    for goal, arm in dict.fromkeys((run["goal"], run["arm"]) for run in results):
+        runs = [run for run in results if (run["goal"], run["arm"]) == (goal, arm)]
+        paired = np.array([run["area"] - areas[goal, "scratch", run["seed"]] for run in runs])
+        last = np.array([np.mean(run["reached"][-3:]) for run in runs])
+        area = np.array([run["area"] for run in runs])
+        more = "" if arm == "scratch" else f"{paired.mean():+.2f} ± {paired.std(ddof=1):.2f}"
+        figures = " | ".join(f"{values.mean():.2f} ± {values.std(ddof=1):.2f}" for values in (area, last))
+        rows.append(f"| {goal} | {arm} | {len(runs)} | {figures} | {more} |")
+    return "\n".join(rows)
+
+
 def main() -> None:
     """Goal A from scratch, then goal B in every arm."""
     parser = argparse.ArgumentParser(
@@ -114,6 +131,7 @@ def main() -> None:
                 print(line, flush=True)
                 with results.open("a") as file:
                     file.write(line + "\n")
+    print(table([json.loads(line) for line in results.read_text().splitlines()]))
 
 
 if __name__ == "__main__":
