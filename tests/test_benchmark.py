@@ -58,6 +58,7 @@ def sb3_eqr(monkeypatch, capfd):
     return call
 
 
+@pytest.mark.slow
 def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     line = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml qrdqn:fast.yml"
     code, out = sb3_eqr(f"{line} --games cartpole --seeds 1")

@@ -47,7 +47,7 @@ class Ring(gym.Env):
 
 def train(seed, total_timesteps=1_200, **kwargs):
     env = make_vec_env(Ring, 8, seed)
-    kwargs = {"learning_starts": 200, "still_timesteps": 200, **kwargs}
+    kwargs = {"learning_starts": 200, "still_timesteps": 200, "batch_size": 32, "prediction_depth": 3, **kwargs}
     return train_representation(
         env, "SO(2)", policy="MlpPolicy", total_timesteps=total_timesteps, seed=seed, device="cpu", **kwargs
     )
@@ -59,7 +59,7 @@ def angles(model):
     return coordinates(blocks.group, blocks.elements)[:, 0, 0].numpy(), places
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_ring_is_found(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
@@ -82,7 +82,7 @@ def test_the_example_as_stated_collapses_and_that_is_told():
 
 
 def test_the_same_seed_gives_the_same_representation():
-    one, two = train(3, 560), train(3, 560)
+    one, two = train(3, 500), train(3, 500)
     for (name, value), other in zip(one.policy.state_dict().items(), two.policy.state_dict().values(), strict=True):
         assert th.equal(value, other), name
 

@@ -199,6 +199,7 @@ def test_the_search_space_makes_agents(name):
     assert len(groups) > 1
 
 
+@pytest.mark.slow
 def test_the_flags_of_rl_zoo_together(sb3_eqr, tmp_path):
     """Processes, normalisation, TensorBoard, checkpoints, a saved buffer: trained, played, gone on."""
     entry = {
