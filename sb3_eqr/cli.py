@@ -16,5 +16,8 @@ def main() -> None:
         run = importlib.import_module(f"sb3_eqr.{extra}.__main__").main
     except ImportError as error:
         advice = "" if "pip install" in str(error) else f'. pip install "sb3-eqr[{extra}]" brings it'
-        sys.exit(f"sb3-eqr: {error}{advice}")
+        others = (
+            "" if extra in COMMANDS else ". Without it there are: " + ", ".join(f"sb3-eqr {name} --help" for name in COMMANDS)
+        )
+        sys.exit(f"sb3-eqr: {error}{advice}{others}")
     run()

@@ -111,7 +111,13 @@ def train_representation(
     :warns UserWarning: if the representation has collapsed (:func:`~sb3_eqr.visualize.diagnostics.find_verdict`)
     """
     check_number("still_timesteps", still_timesteps, 0, whole=True)
-    check_number("total_timesteps", total_timesteps, learning_starts + still_timesteps + 1, whole=True)
+    check_number("total_timesteps", total_timesteps, 1, whole=True)
+    if total_timesteps <= learning_starts + still_timesteps:
+        raise ValueError(
+            f"total_timesteps: expected more than learning_starts + still_timesteps = {learning_starts + still_timesteps}, "
+            f"found {total_timesteps}. Pass more steps, or lower learning_starts (random steps before the first update) and "
+            "still_timesteps (steps in which actions do nothing)."
+        )
     model = EqRQRDQN(
         policy,
         env,

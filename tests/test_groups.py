@@ -236,7 +236,7 @@ def test_bad_names_are_refused_with_the_legal_ones(name):
 def test_bad_parameterization_and_generators():
     with pytest.raises(ValueError, match="euler"):
         make_group("SO(3)", parameterization="quaternion")
-    for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]]):
+    for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]], [[[1.0]], [[2.0]]]):
         with pytest.raises(ValueError, match=r"\(D, m, m\)"):
             MatrixLieGroup(generators)
 

@@ -180,3 +180,12 @@ def test_augmentation_switches(make, off):
         th.testing.assert_close(ratios, ratios[:, :1].expand_as(ratios))
     else:
         assert not th.equal(found, images)
+
+
+def test_the_learning_rate_never_falls_below_zero(make):
+    """The last round goes beyond the total, where a line, such as RL Zoo's lin_1e-3, is negative."""
+    seen = []
+    model = make(ChainEnv(), learning_rate=lambda progress: seen.append(progress) or 1e-2 * progress, train_freq=64)
+    model.learn(150)  # ends at 192
+    assert model.num_timesteps == 192 and min(seen) == 0
+    assert all(group["lr"] >= 0 for group in model.policy.optimizer.param_groups)

@@ -400,3 +400,10 @@ def test_layouts():
     assert (info["translation"] == 0.5).all() and json.dumps(still.metadata)
     mean = np.mean([env.reset(seed=seed)[0].max(axis=2) > 40 for seed in range(50)])
     assert 0.03 < mean < 0.5  # enough to see, and something dark between
+
+
+@pytest.mark.parametrize("env_id", list(envs.WORLDS))
+def test_every_action_has_a_name(env_id):
+    env = gym.make(env_id)
+    names = env.unwrapped.get_action_meanings()
+    assert len(names) == len(set(names)) == env.action_space.n

@@ -76,7 +76,7 @@ class EqRAlgorithm(EqRSetup):
         buffer = self.replay_buffer
         assert buffer is not None
         self._collect_metrics()
-        remaining = max(self._current_progress_remaining, 0.0)
+        remaining = self._current_progress_remaining
         if isinstance(buffer, PrioritizedSequenceReplayBuffer):
             buffer.beta = self.priority_final_beta + (self.priority_beta - self.priority_final_beta) * remaining
             self.logger.record("train/beta", buffer.beta)

@@ -156,6 +156,12 @@ class EqRSetup(EqRArguments):
             self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
         )
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last round may end beyond the total. A schedule that is a line, such as RL Zoo's, would give a learning rate
+        # below 0 there: gradient ascent, to the end.
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
         check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step

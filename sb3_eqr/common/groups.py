@@ -235,7 +235,7 @@ class MatrixLieGroup(MatrixGroup):
     Any matrix Lie group, given by a basis of its algebra: element = exp(Σ β_i E⁽ⁱ⁾) (Eq. 13).
 
     :param generators: the basis E⁽ⁱ⁾, (D, m, m), anything ``torch.as_tensor`` takes; finite, D ≥ 1, m ≥ 1
-    :raises ValueError: if the shape is another or an entry is not finite
+    :raises ValueError: if the shape is another, an entry is not finite, or they depend on each other
     """
 
     def __init__(self, generators: th.Tensor | Sequence):
@@ -244,6 +244,11 @@ class MatrixLieGroup(MatrixGroup):
             raise ValueError(
                 f"generators: expected D >= 1 finite square matrices, shape (D, m, m), found shape {tuple(basis.shape)}"
                 f"{'' if basis.isfinite().all() else ' with entries that are not finite'}"
+            )
+        if th.linalg.matrix_rank(basis.flatten(1)) < len(basis):
+            raise ValueError(
+                f"generators: expected a basis, found {len(basis)} matrices that depend on each other. Leave out those that are "
+                "sums of others."
             )
         self.generators = basis
         checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups

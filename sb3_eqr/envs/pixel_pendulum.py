@@ -114,6 +114,12 @@ class PixelPendulum(gym.Env):
         distance = np.hypot(rows - nearest * along[0], columns - nearest * along[1])
         return np.rint(255 * np.clip(self.size / 24 + 0.5 - distance, 0, 1)).astype(np.uint8)
 
+    def get_action_meanings(self) -> list[str]:
+        """
+        :return: the torque of each action, in N m
+        """
+        return [f"{torque:+.3g}" for torque in self.torques]
+
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
         :return: with ``render_mode="rgb_array"`` (4 size, 4 size, 3), uint8

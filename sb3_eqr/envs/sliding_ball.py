@@ -91,6 +91,12 @@ class SlidingBall(gym.Env):
         there = self._at_goal()
         return self.draw(self.position), float(there), there, False, {"position": self.position}
 
+    def get_action_meanings(self) -> list[str]:
+        """
+        :return: a name per action, as ALE's environments have them
+        """
+        return ["UP", "DOWN", "LEFT", "RIGHT"][: 2 * self.dimensions]
+
     def _at_goal(self) -> bool:
         if self.goal is None:
             return False

@@ -133,6 +133,14 @@ class StarField(gym.Env):
         squares = (centred - y[:, None])[:, :, None] ** 2 + (centred - x[:, None])[:, None, :] ** 2
         return np.clip(radius[:, None, None] + 0.5 - np.sqrt(squares), 0, 1)
 
+    def get_action_meanings(self) -> list[str]:
+        """
+        :return: a name per action, as ALE's environments have them
+        """
+        turns = ["PITCH UP", "PITCH DOWN", "YAW RIGHT", "YAW LEFT", "ROLL RIGHT", "ROLL LEFT"]
+        moves = ["FORWARD", "BACK", "RIGHT", "LEFT", "UP", "DOWN"]
+        return (turns + moves)[: int(self.action_space.n)]  # type: ignore[attr-defined]
+
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
         :return: with ``render_mode="rgb_array"`` (4 size, 4 size, 3), uint8
