@@ -236,9 +236,11 @@ def test_bad_names_are_refused_with_the_legal_ones(name):
 def test_bad_parameterization_and_generators():
     with pytest.raises(ValueError, match="euler"):
         make_group("SO(3)", parameterization="quaternion")
-    for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]], [[[1.0]], [[2.0]]]):
+    for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]]):
         with pytest.raises(ValueError, match=r"\(D, m, m\)"):
             MatrixLieGroup(generators)
+    with pytest.raises(ValueError, match="expected a basis, found 2 matrices that depend on each other"):
+        MatrixLieGroup([[[1.0]], [[2.0]]])
 
 
 def test_a_group_passes_through():

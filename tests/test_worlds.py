@@ -402,7 +402,7 @@ def test_layouts():
     assert 0.03 < mean < 0.5  # enough to see, and something dark between
 
 
-@pytest.mark.parametrize("env_id", list(envs.WORLDS))
+@pytest.mark.parametrize("env_id", [name for name in envs.WORLDS if name != "BlindCliffwalk-v0"])
 def test_every_action_has_a_name(env_id):
     env = gym.make(env_id)
     names = env.unwrapped.get_action_meanings()
