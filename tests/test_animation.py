@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from PIL import ImageDraw
 from stable_baselines3 import DQN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -15,10 +16,10 @@ from sb3_eqr.common.safe_files import get_rng_state
 from sb3_eqr.visualize import animation
 from sb3_eqr.visualize.animation import predictions, record, shoot
 from sb3_eqr.visualize.callback import LatentCallback
-from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
+from sb3_eqr.visualize.canvas import AXES, HEIGHT, WIDTH, Line, Painter
 from sb3_eqr.visualize.latents import encode
 from sb3_eqr.visualize.pixels import observed_pictures
-from sb3_eqr.visualize.sketches import ARROW, ROOM, Panel, Shape, in_plane, panel
+from sb3_eqr.visualize.sketches import ARROW, ROOM, Panel, Shape, in_plane, panel, panels
 from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
 
@@ -176,6 +177,34 @@ def test_files_have_the_frames_and_generators_are_kept(make, group, tmp_path):
 
 
 @EITHER
+def test_a_video_suffix_is_left_out(make, tmp_path):
+    paths = record(make("CartPole-v1"), "CartPole-v1", tmp_path / "v.mp4", 7, 2, formats=("gif",))
+    assert [path.name for path in paths] == ["v.gif"]
+
+
+def test_blocks_are_numbered_from_zero(make):
+    model = make(ChainEnv(8), get_coef=0, policy_kwargs={"group": "SE(2)^2 x SO(3)", "n_blocks": None})
+    states = encode(model, th.zeros(2, 3))
+    assert [found.name for found in panels(model, states, states, 9)] == ["0 SE(2)", "1 SE(2)", "2 SO(3)"]
+
+
+@pytest.mark.parametrize("name, said", [("SO(3)", "solid: now"), ("SE(3)", "pale: predicted 2"), ("SE(2)", "predicted 2")])
+def test_the_legend_is_of_what_is_drawn(name, said, monkeypatch):
+    """Axes have their own colours, and their letters are in these."""
+    written = []
+    text = ImageDraw.ImageDraw.text
+    monkeypatch.setattr(
+        ImageDraw.ImageDraw,
+        "text",
+        lambda self, at, what, fill, *args, **kw: (written.append((what, fill)), text(self, at, what, fill, *args, **kw)),
+    )
+    Painter([panel("0", *elements(name), elements(name)[1])], np.zeros(7, int), 2, "about" * 99)
+    assert any(what.startswith(said) for what, _ in written)
+    letters = {what: fill for what, fill in written if what in "xyz"}
+    assert letters == ({} if name == "SE(2)" else dict(zip("xyz", AXES, strict=True)))
+
+
+@EITHER
 def test_the_same_seed_draws_the_same_frames(make, tmp_path, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy")
     model.exploration_rate = 1.0  # ε-greedy actions have a generator of their own
@@ -250,7 +279,7 @@ def test_what_cannot_be_filmed_is_refused(make, tmp_path):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
     with pytest.raises(ValueError, match="env: expected the agent's observation_space"):
         record(model, ImageEnv(), tmp_path / "v")
-    with pytest.raises(ValueError, match="model: expected an EqR agent, found DQN"):
+    with pytest.raises(ValueError, match=r"record: expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN, which"):
         record(DQN("MlpPolicy", ChainEnv()), ChainEnv(), tmp_path / "v")
 
 

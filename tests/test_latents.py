@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage
 
 import sb3_eqr.envs
 from sb3_eqr import EqRQRDQN
+from sb3_eqr.common.groups import Group
 from sb3_eqr.envs import SlidingBall, make_atari100k_env
-from sb3_eqr.visualize.latents import play
+from sb3_eqr.visualize.diagnostics import diagnose
+from sb3_eqr.visualize.latent_figure import latent_figure
+from sb3_eqr.visualize.latents import coordinate_names, coordinates, encode, frame, play
 from tests.toys import ChainEnv
 
 sb3_eqr.envs.register()
@@ -62,3 +66,52 @@ def test_atari_can_be_shown_in_colour():
     env = make_atari100k_env("Pong", seed=0, render_mode="rgb_array")
     env.reset()
     assert env.render().shape == (210, 160, 3)
+
+
+class Scalings(Group):
+    """A group of one's own, whose elements are no matrices (docs/groups.md)."""
+
+    def __init__(self, n):
+        super().__init__(f"Scalings({n})", num_params=n, element_shape=(n,))
+
+    def element(self, params):
+        return params.exp()
+
+    def compose(self, left, right):
+        return left * right
+
+    def inverse(self, element):
+        return 1 / element
+
+    def identity(self, *batch, dtype=None, device=None):
+        return th.ones(*batch, *self.element_shape, dtype=dtype, device=device)
+
+
+@pytest.mark.parametrize("n_blocks", [2, 8])
+def test_elements_that_are_no_matrices_are_vectors(n_blocks):
+    """Also where there are as many blocks as numbers in each."""
+    group = Scalings(2)
+    found = th.rand(5, n_blocks, 2, generator=th.Generator().manual_seed(0))
+    assert coordinate_names(group) == ["x 0", "x 1"] and th.equal(coordinates(group, found), found - 1)
+    matrix, vector = frame(group, found)
+    assert matrix is None and th.equal(vector, found)
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"group": group, "n_blocks": n_blocks}, device="cpu", seed=0)
+    windows = play(model, make_vec_env(ChainEnv), 60, depth=2)
+    diagnosed = diagnose(model, windows)
+    assert diagnosed.generators[0].mean.shape == (3, n_blocks, 2) and len(diagnosed.blocks) == n_blocks
+    states = encode(model, windows.samples.observations)
+    offsets = latent_figure(model, states).axes[0].collections[0].get_offsets()
+    np.testing.assert_allclose(offsets, states[:, :2].numpy())
+
+
+def test_other_agents_are_refused():
+    model = DQN("MlpPolicy", "CartPole-v1", device="cpu")
+    windows = play(EqRQRDQN("MlpPolicy", "CartPole-v1", device="cpu"), "CartPole-v1", 40, depth=2)  # an id is enough
+    message = r"expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN, which has no latent model"
+    for look in (
+        lambda: play(model, "CartPole-v1"),
+        lambda: diagnose(model, windows),
+        lambda: encode(model, windows.samples.observations),
+    ):
+        with pytest.raises(ValueError, match=message):
+            look()

@@ -188,7 +188,37 @@ def test_every_group(group):
 
 def test_dict_observations_and_an_agent_without_latent_losses():
     model = make_model(EqRRainbow, "MultiInputPolicy", Ring(keys=True), prediction_depth=0)
-    assert look(model, keys=True).verdict == "does not predict"
+    found = look(model, keys=True)
+    assert found.verdict == "does not predict" and not found.rewards_trained and not found.symmetry_trained
+
+
+@pytest.mark.parametrize("off", ["reward", "get"])
+def test_what_was_never_trained_is_told(off):
+    found = look(make_model(**{f"{off}_coef": 0}))
+    tables, title = all_tables(found, ["0", "1"]), all_pictures(found, ["0", "1"])["rewards"]._suptitle.get_text()
+    assert tables["rewards"]["trained"].tolist() == [off != "reward"] * 3
+    assert tables["action_symmetry"]["trained"].tolist() == [off != "get"]
+    assert ("not trained" in title) == (off == "reward")
+
+
+def test_pictures_have_one_scale_and_room_for_what_they_show():
+    found = look(make_model(n_blocks=7))
+    figures = all_pictures(found, ["0", "1"])
+    images = [ax.images[0] for ax in figures["motion"].axes[:2]]
+    assert images[0].get_clim() == images[1].get_clim() == (0, max(values.max() for values in found.motion))
+    assert not figures["motion"].axes[0].texts  # seven columns are too many for numbers
+    (ax,) = figures["collapse"].axes
+    x, y = ax.lines[0].get_data()
+    assert ax.get_xlim()[0] < x.min() and x.max() < ax.get_xlim()[1]
+    assert ax.get_ylim()[0] < y.min() and y.max() < ax.get_ylim()[1]
+    assert all(tick == round(tick) for tick in ax.get_xticks())
+
+
+@pytest.mark.parametrize("label, colours", [("angle", "twilight"), ("position 0", "twilight"), ("velocity", "viridis")])
+def test_factors_that_go_round_have_colours_that_do(label, colours):
+    model = make_model(group="SE(2)")
+    figure = latent_figure(model, th.randn(9, 18, generator=th.Generator().manual_seed(0)), np.arange(9.0), label)
+    assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
 
 
 def test_many_blocks_and_points_in_one_figure():
@@ -266,8 +296,8 @@ def test_the_algorithm_is_in_the_file(tmp_path):
         ("{model} --env CartPole-v1", "the environment is not the agent's. Observation spaces do not match"),
         ("{model} --env Ring-v0 --env-kwargs unwound", "--env-kwargs: expected key:value, found 'unwound'"),
         ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not take {'speed': 2}"),
-        ("{model} --env Ring-v0 --steps 5", "n_steps: expected .*8.*found 5"),
-        ("{model} --env Ring-v0 --depth 0", "depth: expected .*1.*found 0"),
+        ("{model} --env Ring-v0 --steps 5", "visualize: --steps: expected .*8.*found 5"),
+        ("{model} --env Ring-v0 --depth 0", "visualize: --depth: expected .*1.*found 0"),
         ("{model} --env Ring-v0 --n-envs 0", "--n-envs: expected at least 1, found 0"),
         ("{model} --env ALE/Pong-v5 --env-kwargs mode:1", "--env-kwargs: expected none for Atari"),
         ("{model} --algo dqn", "invalid choice: 'dqn'"),

@@ -18,6 +18,7 @@ from sb3_eqr.visualize.tables import all_tables, write_tables
 from sb3_eqr.visualize.tables import factor_names as all_names
 
 DEPTH = 5  # where the agent has no latent losses
+FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # what an argument of play is called here
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -50,7 +51,11 @@ def run(args: argparse.Namespace) -> None:
     model = load_model(args.model, args.algo, args.device)
     env = make_env(model, args.model, args.env, parse_kwargs(args.env_kwargs), args.n_envs, args.seed, args.video)
     depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
-    played = play(model, env, args.steps, depth, args.deterministic, args.seed)
+    try:
+        played = play(model, env, args.steps, depth, args.deterministic, args.seed)
+    except ValueError as error:
+        name, colon, message = str(error).partition(":")
+        raise ValueError(f"{FLAGS.get(name, name)}{colon}{message}") from error
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
     actions, factors = action_names(env, model.policy.latent_model.n_actions), factor_names(env)

@@ -19,7 +19,7 @@ from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.safe_files import atomic_write, get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
-from sb3_eqr.visualize.latents import encode, eval_mode
+from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode
 from sb3_eqr.visualize.loading import action_names
 from sb3_eqr.visualize.pixels import observed_pictures
 from sb3_eqr.visualize.sketches import panels
@@ -45,7 +45,7 @@ class Film(NamedTuple):
 
 def record(
     model: EqRAlgorithm,
-    env: GymEnv,
+    env: GymEnv | str,
     path: str | pathlib.Path,
     n_steps: int = 200,
     depth: int = 5,
@@ -66,7 +66,8 @@ def record(
     :param model: any EqR agent; its latent model predicts only where it was trained (``prediction_depth`` > 0)
     :param env: not the one in training, preprocessed as in training; a VecNormalize with ``training=False``. Of several
         environments the first is filmed. With ``render_mode="rgb_array"`` its rendering is shown, else what the agent sees
-    :param path: without suffix; every format adds its own. Folders are made, files written beside and renamed
+    :param path: without suffix (.mp4 and .gif are left out); every format adds its own. Folders are made, files written beside
+        and renamed
     :param n_steps: of the environment, one frame each; more than ``depth``
     :param depth: M ≥ 1
     :param seed: of the environment and of the agent's noise
@@ -77,10 +78,11 @@ def record(
     :raises ValueError: for an argument out of its range, or an environment that is not the agent's
     :raises ImportError: without the extra "visualize"
     """
-    if not isinstance(model, EqRAlgorithm):
-        raise ValueError(f"model: expected an EqR agent, found {type(model).__name__}. Load it by the class that saved it.")
+    check_agent("record", model)
     check_number("depth", depth, 1, whole=True)
     check_number("n_steps", n_steps, depth + 1, whole=True)
+    path = pathlib.Path(path)
+    path = path.with_suffix("") if path.suffix[1:].lower() in FORMATS else path  # x.mp4 would become x.mp4.mp4
     fps = FPS if fps is None else fps
     check_number("fps", fps, 1, 50)  # what a GIF can do
     if not formats or set(formats) - set(FORMATS):
@@ -91,10 +93,10 @@ def record(
     ghosts = predictions(model, states, film.actions, film.starts, depth)
     shown = panels(model, states, ghosts, MAX_PANELS)
     painter = Painter(shown, film.starts, depth, describe(model, len(shown)))
-    return write_video(frames(film, painter), pathlib.Path(path), formats, fps)
+    return write_video(frames(film, painter), path, formats, fps)
 
 
-def shoot(model: EqRAlgorithm, env: GymEnv, n_steps: int, seed: int, deterministic: bool) -> Film:
+def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deterministic: bool) -> Film:
     """
     Let the agent play. Seeds the global generators.
 
@@ -104,7 +106,7 @@ def shoot(model: EqRAlgorithm, env: GymEnv, n_steps: int, seed: int, determinist
     :param seed: of the environment and of the agent's noise
     :param deterministic: whether the agent acts without noise
     """
-    env = model._wrap_env(env, monitor_wrapper=False)
+    env = as_vec_env(model, env)
     for what in ("observation_space", "action_space"):
         if getattr(env, what) != getattr(model, what):
             raise ValueError(

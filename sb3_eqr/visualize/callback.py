@@ -10,7 +10,7 @@ from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure
-from sb3_eqr.visualize.latents import encode, replayed
+from sb3_eqr.visualize.latents import check_agent, encode, replayed
 
 NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
 EXCLUDED = (*NO_PICTURES.values(), "log")  # the name of HumanOutputFormat's file
@@ -50,11 +50,7 @@ class LatentCallback(BaseCallback):
         self._has_warned = False
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, EqRAlgorithm):
-            raise ValueError(
-                f"LatentCallback: expected an EqR agent (EqRQRDQN, EqRRainbow), found {type(self.model).__name__}, "
-                "which has no latent model. Leave the callback out."
-            )
+        check_agent("LatentCallback", self.model)
 
     def _on_training_start(self) -> None:
         self._looks = self.num_timesteps // self.log_freq

@@ -93,15 +93,25 @@ class Painter:
         page = Image.new("RGB", (WIDTH, HEIGHT), PAPER)
         draw = ImageDraw.Draw(page)
         y = HEIGHT - FOOTER // 2
-        draw.text((12, y), about, FAINT, font(12), anchor="lm")
         ghost = "1 step before" if depth == 1 else f"{depth} steps before"
         beyond = any(p.ghost.dots is not None and (np.abs(p.ghost.dots) > 1).any() for p in self.panels)
-        legend = f"predicted {ghost}{' (at an edge: beyond it)' if beyond else ''}"
-        draw.text((WIDTH - 12, y), legend, FAINT, font(12), anchor="rm")
-        x = WIDTH - 12 - round(font(12).getlength(legend)) - 14
-        draw.text((x - 58, y), "now", FAINT, font(12), anchor="lm")
-        page.paste(_symbol(ghost=False), (x - 80, y - 10))
-        page.paste(_symbol(ghost=True), (x - 10, y - 10))
+        axes = any(p.kind == "axes" for p in self.panels)
+        words = ("solid: now", "pale: predicted") if axes else ("now", "predicted")
+        last = f"{words[1]} {ghost}{' (at an edge: beyond it)' if beyond else ''}"
+        marked = any(p.kind != "axes" or p.truth.dots is not None for p in self.panels)  # axes alone have no dots
+        x = WIDTH - 12
+        for text, is_ghost in ((last, True), (words[0], False)):
+            draw.text((x, y), text, FAINT, font(12), anchor="rm")
+            x -= round(font(12).getlength(text)) + (24 if marked else 0)
+            if marked:
+                page.paste(_symbol(is_ghost), (x, y - 10))
+            x -= 12
+        for letter, colour in zip("zyx", AXES[::-1], strict=True) if axes else ():
+            draw.text((x, y), letter, colour, font(12), anchor="rm")
+            x -= 12
+        while font(12).getlength(about) > x - 12:
+            about = f"{about.removesuffix('...')[:-1]}..."
+        draw.text((12, y), about, FAINT, font(12), anchor="lm")
         return page
 
     def _ground(self, panel: Panel) -> Image.Image:

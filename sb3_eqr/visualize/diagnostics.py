@@ -20,7 +20,7 @@ from sb3_eqr.visualize.findings import (
     find_generators,
     find_motion,
 )
-from sb3_eqr.visualize.latents import Play, action_elements, eval_mode, latents
+from sb3_eqr.visualize.latents import Play, action_elements, check_agent, eval_mode, latents
 from sb3_eqr.visualize.measures import Rewards, Transition
 
 MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
@@ -41,6 +41,8 @@ class Diagnostics(NamedTuple):
     collapse: Collapse
     rewards: Rewards
     verdict: str  # "predicts", "does not predict" or "collapsed"
+    rewards_trained: bool = True  # whether the agent's settings train its reward predictor
+    symmetry_trained: bool = True  # and ρ
 
     @property
     def summary(self) -> str:
@@ -60,7 +62,9 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     :param model: any EqR agent
     :param play: of :func:`~sb3_eqr.visualize.latents.play` or :func:`~sb3_eqr.visualize.latents.replayed`
     :param seed: draws the pairs of ``action_symmetry``
+    :raises ValueError: if the agent is no EqR agent
     """
+    check_agent("diagnose", model)
     data = latents(model, play.samples)
     project = model.policy.project
     with th.no_grad(), eval_mode(model):
@@ -84,6 +88,8 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
         collapse=find_collapse(model, data.states, play.samples.observations),
         rewards=measures.reward_error(data.predicted_rewards, data.rewards.sign() if signed else data.rewards, data.mask),
         verdict=find_verdict(loss),
+        rewards_trained=model.depth > 0 and model.reward_coef > 0,
+        symmetry_trained=model.depth > 0 and model.get_coef > 0,
     )
 
 

@@ -1,5 +1,7 @@
 """The blocks of latent states as points in the plane: cheap enough to be drawn while an agent trains."""
 
+from typing import Any
+
 import numpy as np
 import torch as th
 from matplotlib.axes import Axes
@@ -15,6 +17,7 @@ from sb3_eqr.visualize.style import GREY, MAX_PANELS, SIZE, panels, settings
 
 MAX_POINTS = 400
 MAX_ARROWS = 150
+CYCLIC = ("position", "angle")  # factors whose ends may be one: they get a colour map without a seam
 
 
 def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time") -> Figure:
@@ -36,13 +39,14 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
     ]
     spreads = np.array([float(found.flatten(1).double().std(dim=0, correction=0).norm()) for _, _, found in blocks])
     shown = sorted(np.argsort(-spreads, kind="stable")[:MAX_PANELS])
+    cyclic = label.split(" ")[0] in CYCLIC
     with settings():
         figure = Figure(figsize=SIZE)  # a constrained layout would take longer than all the drawing
         axes = panels(figure, len(shown))
         for ax, i in zip(axes, shown, strict=True):
             group, name, found = blocks[i]
             constant = spreads[i] <= ROUNDING * float(found.norm()) / len(found) ** 0.5
-            drawn = _draw(ax, group, found, colours)
+            drawn = _draw(ax, group, found, colours, "twilight" if cyclic else "viridis")
             about = " (constant)" if constant else _outside(ax, drawn.get_offsets())
             ax.set_title(f"{name}{about}", loc="left", fontsize=8, pad=3)
             ax.tick_params(labelsize=6, length=2, pad=1)
@@ -54,10 +58,11 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
         return figure
 
 
-def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray) -> PathCollection:
+def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap: str) -> PathCollection:
     """
     :param elements: of one block, (n, *element_shape)
     :param colours: (n,)
+    :param cmap: matplotlib's name of their colour map
     :return: for the colour bar
     """
     low, high = float(colours.min()), float(colours.max())
@@ -72,14 +77,15 @@ def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray) -> P
         if matrix is not None:
             few = slice(None, None, -(-len(points) // MAX_ARROWS))
             arrows = matrix[few, :, 0].numpy()
-            ax.quiver(*points[few].T, *arrows.T, colours[few], clim=(low, high), width=0.006, scale=10, alpha=0.6)
+            looks: Any = {"clim": (low, high), "cmap": cmap, "width": 0.006, "scale": 10, "alpha": 0.6}
+            ax.quiver(*points[few].T, *arrows.T, colours[few], **looks)
         _roomy(ax, points)
     elif elements[0].numel() == 1:
         points = np.stack([np.arange(len(elements)), elements.flatten().numpy()], axis=1)
     else:
         points = _principal(elements.flatten(1))
         _roomy(ax, points)
-    return ax.scatter(points[:, 0], points[:, 1], c=colours, s=6, linewidths=0, vmin=low, vmax=high)
+    return ax.scatter(points[:, 0], points[:, 1], c=colours, s=6, linewidths=0, vmin=low, vmax=high, cmap=cmap)
 
 
 def _roomy(ax: Axes, points: np.ndarray) -> None:

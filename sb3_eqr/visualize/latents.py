@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
@@ -12,7 +14,7 @@ from torch.nn import functional as F
 from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.groups import SE, SO, Group, MatrixLieGroup, NoGroup, ProductGroup, T
+from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, MatrixLieGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
@@ -47,22 +49,41 @@ class Blocks(NamedTuple):
     elements: th.Tensor  # (..., K, *element_shape)
 
 
+def check_agent(name: str, model: Any) -> None:
+    """
+    :param name: of what asks, for the message
+    :raises ValueError: if the model is no EqR agent
+    """
+    if not isinstance(model, EqRAlgorithm):
+        found = type(model).__name__
+        raise ValueError(f"{name}: expected an EqR agent (EqRQRDQN, EqRRainbow), found {found}, which has no latent model.")
+
+
+def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
+    """
+    :param env: or its id of gymnasium
+    :return: images channels first, as the agent's own environment
+    """
+    return model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
+
+
 def play(
-    model: EqRAlgorithm, env: VecEnv, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
+    model: EqRAlgorithm, env: GymEnv | str, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
 ) -> Play:
     """
     Let the agent play, and cut the play into windows. Every random generator but the environments' is left as it was.
 
     :param model: any EqR agent
-    :param env: with the agent's observations and actions, preprocessed as in training
+    :param env: with the agent's observations and actions, preprocessed as in training; or its id of gymnasium
     :param n_steps: over all environments, at least 2 · depth + 2 each
     :param depth: M ≥ 1, how many steps each window looks ahead
     :param deterministic: whether the agent acts without noise; else as it explores
     :param seed: of the environment and of the agent's noise
     :return: every window that was complete, in order
-    :raises ValueError: if there are too few steps
+    :raises ValueError: if there are too few steps, or the agent is no EqR agent
     """
-    env = model._wrap_env(env, monitor_wrapper=False)  # images channels first, as the agent's own environment
+    check_agent("play", model)
+    env = as_vec_env(model, env)
     check_number("depth", depth, 1, whole=True)
     check_number("n_steps", n_steps, (2 * depth + 2) * env.num_envs, whole=True)
     buffer = SequenceReplayBuffer(
@@ -122,7 +143,9 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     :param model: any EqR agent
     :param observations: as the replay buffer has them, (N, *obs_shape) or a dict of these
     :return: (N, D), without gradient
+    :raises ValueError: if the agent is no EqR agent
     """
+    check_agent("encode", model)
     n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
     pieces = []
     with th.no_grad(), eval_mode(model):
@@ -198,13 +221,13 @@ def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
 
 def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
     """
-    An element as a moving frame: what turns (or shears), and what shifts.
+    An element as a moving frame: what turns (or shears), and what shifts. An element that is no matrix is a vector.
 
     :param elements: (..., *element_shape)
     :return: a matrix, (..., n, n), or ``None``; a vector, (..., n), or ``None``
     """
-    if isinstance(group, (T, NoGroup)):
-        return None, elements
+    if not isinstance(group, MatrixGroup):  # T, none, and a group of one's own
+        return None, elements.reshape(*elements.shape[: elements.dim() - len(group.element_shape)], -1)
     if isinstance(group, SE) or _is_affine(group):
         return elements[..., :-1, :-1], elements[..., :-1, -1]
     return elements, None
@@ -213,7 +236,8 @@ def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tenso
 def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
     """
     An element in numbers that are 0 at the identity: the angles of a rotation's logarithm, radians in (-π, π], one per
-    plane i < j; the entries less the identity's where the matrix is no rotation; then the translation.
+    plane i < j; the entries less the identity's where the matrix is no rotation; then the translation. The entries less the
+    identity's of an element that is no matrix.
 
     :param elements: (..., *element_shape)
     :return: (..., C), C = len(coordinate_names(group))
@@ -224,14 +248,16 @@ def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
         parts.append(_rotation_log(matrix))
     elif matrix is not None:
         parts.append((matrix - th.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)).flatten(-2))
-    if vector is not None:
+    if vector is not None and _is_own(group):
+        parts.append(vector - group.identity(dtype=vector.dtype, device=vector.device).flatten())
+    elif vector is not None:
         parts.append(vector)
     return th.cat(parts, dim=-1)
 
 
 def coordinate_names(group: Group) -> list[str]:
     """
-    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...
+    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... where an element is no matrix
     """
     matrix, vector = frame(group, th.zeros(group.element_shape))
     names = []
@@ -240,7 +266,7 @@ def coordinate_names(group: Group) -> list[str]:
         rotation = isinstance(group, (SO, SE))
         pairs = [(i, j) for i in range(n) for j in range(n) if i < j or not rotation]
         names = [f"{'angle' if rotation else 'a'} {i}-{j}" for i, j in pairs]
-    return names + ([] if vector is None else [f"t {i}" for i in range(vector.shape[-1])])
+    return names + ([] if vector is None else [f"{'x' if _is_own(group) else 't'} {i}" for i in range(vector.shape[-1])])
 
 
 def _rotation_log(rotation: th.Tensor) -> th.Tensor:
@@ -258,6 +284,11 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
     log = (vectors * (1j * values.angle())[..., None, :] @ th.linalg.inv(vectors)).real
     i, j = th.triu_indices(n, n, 1)
     return log[..., i, j].to(dtype)
+
+
+def _is_own(group: Group) -> bool:
+    """Whether it is a group of the user's own whose elements are no matrices."""
+    return not isinstance(group, (MatrixGroup, T, NoGroup))
 
 
 def _is_affine(group: Group) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
 from sb3_eqr.common.safe_files import atomic_write
@@ -24,6 +25,7 @@ __all__ = ["all_pictures", "latent_figure", "write_pictures"]
 DPI = 150
 MAX_COORDINATES = 6  # of a block, in one panel
 MAX_NUMBERS = 36  # in a heat map
+MAX_NUMBER_COLUMNS = 6  # of one: else they run into each other
 MAX_LETTERS = 72  # beside each other at the foot of a figure
 
 
@@ -84,26 +86,25 @@ def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
     """How far each action moves each block: as predicted in every state, and as observed where it was played."""
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
+    top = max(np.nanmax(values, initial=0) for values in diagnostics.motion) or 1.0  # one scale for both
     for ax, values, title in zip(axes, diagnostics.motion, ("predicted", "observed"), strict=True):
-        _heat_map(figure, ax, values, f"{title} motion", vmin=0)
+        image = _heat_map(ax, values, f"{title} motion", top)
         _block_ticks(ax, diagnostics.blocks)
     axes[0].set_yticks(range(len(actions)), actions, fontsize=8 if len(actions) < 12 else 6)
     axes[0].set_ylabel("action")
+    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
     return figure
 
 
-def _heat_map(figure: Figure, ax: Axes, values: np.ndarray, title: str, vmin: float, vmax: float | None = None) -> None:
+def _heat_map(ax: Axes, values: np.ndarray, title: str, top: float) -> AxesImage:
     ax.set_facecolor("#dddddd")  # where nothing is known
-    image = ax.imshow(
-        np.ma.masked_invalid(values), cmap="viridis", aspect="auto", interpolation="nearest", vmin=vmin, vmax=vmax
-    )
-    figure.colorbar(image, ax=ax, location="bottom", shrink=0.9, aspect=30)
-    if values.size <= MAX_NUMBERS:
-        top = np.nanmax(values, initial=0) if vmax is None else vmax
+    image = ax.imshow(np.ma.masked_invalid(values), cmap="viridis", aspect="auto", interpolation="nearest", vmin=0, vmax=top)
+    if values.size <= MAX_NUMBERS and values.shape[1] <= MAX_NUMBER_COLUMNS:
         for (row, column), value in np.ndenumerate(values):
             dark = value < 0.6 * top
             ax.text(column, row, f"{value:.2g}", ha="center", va="center", color="white" if dark else "black")
     ax.set_title(title, loc="left")
+    return image
 
 
 def _block_ticks(ax: Axes, blocks: Sequence[str]) -> None:
@@ -164,15 +165,16 @@ def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()
     found = diagnostics.disentanglement
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = figure.subplots(1, 1 if found.information is None else 2, squeeze=False)[0]
-    _heat_map(figure, axes[0], found.redundancy, "correlation between blocks", vmin=0, vmax=1)
+    image = _heat_map(axes[0], found.redundancy, "correlation between blocks", 1)
     _block_ticks(axes[0], diagnostics.blocks)
     axes[0].set_yticks(axes[0].get_xticks())
     axes[0].set_ylabel("block")
     if found.information is not None:
         names = factor_names(found.information.shape[1], factors)
-        _heat_map(figure, axes[1], found.information.T, "information on true factors", vmin=0, vmax=1)
+        _heat_map(axes[1], found.information.T, "information on true factors", 1)
         _block_ticks(axes[1], diagnostics.blocks)
         axes[1].set_yticks(range(len(names)), names)
+    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
     return figure
 
 
@@ -181,18 +183,22 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
     found = diagnostics.collapse
     figure = Figure(figsize=SIZE, layout="constrained")
     ax = figure.subplots()
-    ax.plot(np.arange(1, len(found.spectrum) + 1), found.spectrum, color=COLORS[0], marker="o", markersize=3, linewidth=1)
+    seen = found.spectrum[found.spectrum > found.spectrum[0] * ROUNDING]  # below, there is nothing but rounding
+    seen = seen if len(seen) else found.spectrum
+    ax.plot(np.arange(1, len(seen) + 1), seen, color=COLORS[0], marker="o", markersize=3, linewidth=1)
     ax.axvline(
         found.effective_rank,
         color=COLORS[1],
         linestyle="--",
         label=f"effective rank {found.effective_rank:.1f} of {found.dimensions}",
     )
-    ax.set(xlabel="principal axis", ylabel="standard deviation")
-    if found.spectrum[0] > 0:
+    more = len(found.spectrum) - len(seen)
+    ax.set(xlabel=f"principal axis{f' ({more} more are 0 but for rounding)' if more else ''}", ylabel="standard deviation")
+    ax.set_xlim(0, len(seen) + 1)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if seen[0] > 0:
         ax.set_yscale("log")
-        ax.set_ylim(found.spectrum[0] * ROUNDING, 2 * found.spectrum[0])
-        ax.set_xlim(0, int((found.spectrum > found.spectrum[0] * ROUNDING).sum()) + 1)
+        ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
     ax.set_title(
         f"Spectrum of the latent states: they spread by {found.spread:.1%} of their size;\n"
@@ -217,5 +223,6 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
     if np.isnan(found.explained).all():
         right.text(0.5, 0.6, "no reward varies", transform=right.transAxes, ha="center")
         right.set(xticks=[], yticks=[])
-    figure.suptitle("Reward prediction", fontsize=10)
+    never = "" if diagnostics.rewards_trained else ": not trained (reward_coef or prediction_depth is 0)"
+    figure.suptitle(f"Reward prediction{never}", fontsize=10)
     return figure

@@ -45,7 +45,7 @@ def panels(model: EqRAlgorithm, states: th.Tensor, ghosts: th.Tensor, limit: int
     several = len(split(model, states)) > 1
     for (group, truth), (_, ghost) in zip(split(model, states.cpu()), split(model, ghosts.cpu()), strict=True):
         for k in range(min(truth.shape[1], limit - len(found))):
-            name = f"{len(found) + 1} {group}" if several else f"{len(found) + 1}"
+            name = f"{len(found)} {group}" if several else f"{len(found)}"
             found.append(panel(name, group, truth[:, k], ghost[:, k]))
     return found
 
@@ -94,8 +94,6 @@ def in_plane(group: Group, elements: th.Tensor, axes: tuple[np.ndarray, np.ndarr
     :param axes: mean, (n,), and two directions, (n, 2), to see a vector by
     """
     matrix, vector = frame(group, elements)
-    if len(group.element_shape) == 1:  # also a group of one's own whose elements are vectors
-        matrix, vector = None, elements
     arrows = dots = None
     if matrix is not None and not (isinstance(group, SE) and matrix.shape[-1] == 1):  # nothing turns in one dimension
         columns = matrix.mT.double().numpy()  # (T, n, n): row i is where the i-th unit vector goes

@@ -24,10 +24,11 @@ def all_tables(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequen
         "generators": _generators(diagnostics, actions),
         "disentanglement": _disentanglement(diagnostics, actions, factors),
         "action_symmetry": pd.DataFrame(
-            [diagnostics.action_symmetry] if diagnostics.action_symmetry else [], columns=ActionSymmetry._fields
+            [(*diagnostics.action_symmetry, diagnostics.symmetry_trained)] if diagnostics.action_symmetry else [],
+            columns=[*ActionSymmetry._fields, "trained"],
         ),
         "collapse": _collapse(diagnostics),
-        "rewards": _per_step(diagnostics.rewards._asdict()),
+        "rewards": _per_step(diagnostics.rewards._asdict()).assign(trained=diagnostics.rewards_trained),
         "summary": _summary(diagnostics),
     }
 
