@@ -247,8 +247,8 @@ class MatrixLieGroup(MatrixGroup):
             )
         if th.linalg.matrix_rank(basis.flatten(1)) < len(basis):
             raise ValueError(
-                f"generators: expected a basis, found {len(basis)} matrices that depend on each other. Leave out those that are "
-                "sums of others."
+                f"generators: expected a basis, found {len(basis)} matrices that depend on each other. Leave out "
+                "those that are sums of others."
             )
         self.generators = basis
         checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups
