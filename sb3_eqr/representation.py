@@ -157,15 +157,20 @@ def train_representation(
     still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
     callbacks = [*still, *(one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given)]
     model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
-    if model.replay_buffer is None or model.replay_buffer.n_starts < 1:
-        return model  # a callback has stopped it before there was a window
+    if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback has stopped it at once
+        _tell(model, {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True})
+    return model
+
+
+def _tell(model: EqRQRDQN, remedies: dict[str, bool]) -> None:
+    """
+    Warn of a collapse; else say what was found, if verbose.
+
+    :param remedies: what to pass instead -> whether it was not passed already
+    """
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
-        remedies = {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True}
-        warnings.warn(
-            f"train_representation: states and actions are nearly constant. {found.summary}. "
-            f"Pass {' or '.join(remedy for remedy, is_open in remedies.items() if is_open)}."
-        )
-    elif verbose > 0:
+        open_remedies = " or ".join(remedy for remedy, is_open in remedies.items() if is_open)
+        warnings.warn(f"train_representation: states and actions are nearly constant. {found.summary}. Pass {open_remedies}.")
+    elif model.verbose > 0:
         print(found.summary)
-    return model

@@ -335,8 +335,15 @@ def test_looking_leaves_the_networks_as_they_were(make):
 
 
 @EITHER
-def test_nothing_is_looked_at_before_a_window_is_complete(make, tmp_path):
-    make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(2, callback=LatentCallback(log_freq=1, n_windows=16))
+def test_nothing_is_looked_at_before_a_window_is_complete(make, tmp_path, monkeypatch):
+    looks = []
+    monkeypatch.setattr("sb3_eqr.visualize.callback.diagnose", lambda model, play: looks.append(play) or 1 / 0)
+    every = LatentCallback(log_freq=1, n_windows=16)
+    make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(1, callback=every)  # a window needs three steps
+    assert not looks
+    with pytest.raises(ZeroDivisionError):  # it would have looked
+        make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(9, callback=every)
+    assert len(looks) == 1
 
 
 @EITHER
