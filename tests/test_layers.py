@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 import torch as th
 from torch import nn
 
@@ -71,17 +72,19 @@ def test_conv_trunk_is_the_network_of_2015():
     th.testing.assert_close(trunk(images), reference(images), rtol=1e-4, atol=1e-5)
 
 
-def test_shift_is_a_crop_of_the_edge_padded_image():
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 6])  # bytes are moved four channels at a time
+@pytest.mark.parametrize("dtype", [th.uint8, th.float32])
+def test_shift_is_a_crop_of_the_edge_padded_image(channels, dtype):
     th.manual_seed(0)
-    images = th.randint(0, 256, (40, 2, 9, 7), dtype=th.uint8)
+    images = th.randint(0, 256, (40, channels, 9, 7)).to(dtype)
     shifted = random_shift(images, pad=2)
-    assert shifted.dtype == th.uint8 and shifted.shape == images.shape
-    padded = nn.functional.pad(images.float(), (2, 2, 2, 2), mode="replicate").to(th.uint8)
+    assert shifted.dtype == dtype and shifted.shape == images.shape
+    padded = nn.functional.pad(images.float(), (2, 2, 2, 2), mode="replicate").to(dtype)
     offsets = set()
     for before, after in zip(padded, shifted, strict=True):
         crops = {(y, x): before[:, y : y + 9, x : x + 7] for y in range(5) for x in range(5)}
         fitting = [offset for offset, crop in crops.items() if th.equal(crop, after)]
-        assert len(fitting) == 1  # both channels moved alike, by a whole number of pixels
+        assert len(fitting) == 1  # all channels moved alike, by a whole number of pixels
         offsets.update(fitting)
     assert len(offsets) > 15  # of 25: images move each on its own
     assert th.equal(random_shift(images, pad=0), images)

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
@@ -48,11 +46,9 @@ class EqRAlgorithm(EqRSetup):
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
         self._target_is_copy = True  # it is built as one
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
-        obs_spaces = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
-        obs_spaces = obs_spaces or {"": self.observation_space}
-        float_images = not self.policy.normalize_images
-        image_keys = [k for k, space in obs_spaces.items() if is_image_space(space, normalized_image=float_images)]
-        self._augment = ImageAugmentation(image_keys, self.shift_pixels, self.intensity_scale)
+        self._augment = ImageAugmentation(
+            self.observation_space, self.policy.normalize_images, self.shift_pixels, self.intensity_scale
+        )
 
     @property
     def _target_is_online(self) -> bool:
@@ -151,22 +147,22 @@ class EqRAlgorithm(EqRSetup):
         """
         policy = self.policy
         observations = self._augment(samples.observations)
-        features = policy.online.features(observations)  # (B, D)
+        features = policy.online.encode(observations)  # (B, D)
         others = [samples.next_observations] if self.td_coef > 0 else []
         n_next = len(samples.actions) if self.td_coef > 0 else 0
         if samples.rollout_observations is not None and self._uses_aet:
             others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
         with th.no_grad():
             other_observations = self._augment(_cat(others)) if others else observations
-            other_features = policy.target.features(other_observations) if others else features[:0]  # (B + B * M, D)
+            other_features = policy.target.encode(other_observations) if others else features[:0]  # (B + B * M, D)
             next_target = next_online = other_features[:n_next]
             if n_next and self.double_q and not self._target_is_online:
-                next_online = policy.online.features(_map(lambda obs: obs[:n_next], other_observations))
+                next_online = policy.online.encode(_map(lambda obs: obs[:n_next], other_observations))
         td = self._q_learning(samples, features, next_online, next_target) if n_next else None
         if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
-            target_states = features.detach() if self._target_is_online else policy.target.features(observations)
+            target_states = features.detach() if self._target_is_online else policy.target.encode(observations)
             target_states = target_states[:, None]
             if self._uses_aet:
                 rollout = other_features[n_next:].unflatten(0, samples.mask.shape)  # (B, M, D)

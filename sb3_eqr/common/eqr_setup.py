@@ -54,6 +54,7 @@ class EqRSetup(EqRArguments):
         self._check_policy_and_spaces()
         self._check_numbers()
         self._check_replay_arguments()
+        _keep_freed_memory()
         if self.env is not None:
             self.frame_stack = self._find_frame_stack()
         buffer_class = self.replay_buffer_class or (
@@ -187,3 +188,12 @@ class EqRSetup(EqRArguments):
         except ValueError:
             self._last_obs = None  # the environment has moved on: another call of learn must reset it
             raise
+
+
+def _keep_freed_memory() -> None:
+    """
+    The C library of Linux gives large blocks back to the system and takes them again page by page, thousands of page faults
+    per update of Atari frames. It learns what is large from the largest block freed so far (mallopt(3), M_MMAP_THRESHOLD;
+    blocks above 32 MiB do not count), and then keeps up to twice as much. So one such is freed.
+    """
+    np.empty(31 << 20, dtype=np.uint8)

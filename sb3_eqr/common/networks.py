@@ -67,6 +67,15 @@ class EqRNetwork(BasePolicy):
         """
         return self.extract_features(obs, self.features_extractor)
 
+    def encode(self, preprocessed_obs: PyTorchObs) -> th.Tensor:
+        """
+        :meth:`features` of observations that have been through SB3's ``preprocess_obs``.
+
+        :param preprocessed_obs: floats, (B, ...), or a dict of these
+        :return: (B, D)
+        """
+        return self.features_extractor(preprocessed_obs)
+
     @abstractmethod
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         """

@@ -1,7 +1,9 @@
 """What every EqR policy adds to an SB3 Q-learning policy."""
 
 import inspect
+from collections.abc import Callable
 from copy import deepcopy
+from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -9,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_eqr.common.checks import check_number
@@ -247,10 +249,15 @@ class EqRPolicy(BasePolicy):
 
         :param tau: in [0, 1]; 1 copies
         """
-        for online, target in self._target_pairs():
-            polyak_update(online.parameters(), target.parameters(), tau)
-            # Running statistics are copied, see https://github.com/DLR-RM/stable-baselines3/issues/996
-            polyak_update(get_parameters_by_name(online, ["running_"]), get_parameters_by_name(target, ["running_"]), 1.0)
+        online, target, online_statistics, target_statistics = self._target_tensors
+        with th.no_grad():
+            if tau < 1:
+                th._foreach_mul_(target, 1 - tau)
+                th._foreach_add_(target, online, alpha=tau)
+            else:
+                th._foreach_copy_(target, online)
+            if online_statistics:  # they are copied, see https://github.com/DLR-RM/stable-baselines3/issues/996
+                th._foreach_copy_(target_statistics, online_statistics)
 
     def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """
@@ -277,6 +284,18 @@ class EqRPolicy(BasePolicy):
                         parameter.copy_(alpha * parameter + (1 - alpha) * drawn if alpha > 0 else drawn)
         self.optimizer.state.clear()
         self.update_target(1.0)
+
+    @cached_property
+    def _target_tensors(self) -> tuple[list[th.Tensor], ...]:
+        """Parameters of the online parts, of their target copies, running statistics of both."""
+        parts = list(zip(*self._target_pairs(), strict=True))
+        parameters = [[p for module in side for p in module.parameters()] for side in parts]
+        statistics = [[t for module in side for t in get_parameters_by_name(module, ["running_"])] for side in parts]
+        return (*parameters, *statistics)
+
+    def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> "EqRPolicy":
+        self.__dict__.pop("_target_tensors", None)  # moved to another device, buffers are other tensors
+        return super()._apply(fn, recurse)
 
     def _target_pairs(self) -> list[tuple[nn.Module, nn.Module]]:
         pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
