@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.envs import SimpleMultiObsEnv
 
+from sb3_eqr.common import eqr_algorithm, preprocessing
 from tests.models import MAKERS
 from tests.toys import ChainEnv, ImageEnv
 
@@ -153,17 +155,32 @@ def test_one_features_pass_serves_both(make, monkeypatch):
     encode = network.encode
     monkeypatch.setattr(network, "encode", lambda self, obs: calls.append((self, len(obs))) or encode(self, obs))
     model.train(1, 8)
-    # s_t with gradient, then everything that the target sees: s_{t+n} and M steps of rollout.
-    assert calls == [(model.policy.online, 8), (model.policy.target, 8 * (1 + 2))]
+    # s_t with gradient, then what the target sees: s_{t+n} and M steps of rollout.
+    assert calls == [(model.policy.online, 8), (model.policy.target, 8), (model.policy.target, 8 * 2)]
+
+
+@pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])
+def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size):
+    """In pieces or whole: the same losses, to rounding."""
+    env = ImageEnv() if policy == "CnnPolicy" else SimpleMultiObsEnv(channel_last=True)
+    model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(60)
+    samples, losses = model.replay_buffer.sample(8), []
+    for at_a_time, n_pieces in ((1, 8), (3 * size, 3), (10**9, 1)):
+        monkeypatch.setattr(eqr_algorithm, "_PIECE", at_a_time)
+        assert len(model._pieces(samples.next_observations)) == n_pieces
+        th.manual_seed(0)
+        losses.append(model._compute_losses(samples)[1].aet)
+    th.testing.assert_close(losses[0], losses[2])
+    th.testing.assert_close(losses[1], losses[2])
 
 
 def test_online_and_target_observations_are_augmented(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(60)
     seen = []
-    augment = model._augment.images
-    monkeypatch.setattr(model._augment, "images", lambda x: seen.append(len(x)) or augment(x))
+    shift = preprocessing.random_shift
+    monkeypatch.setattr(preprocessing, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))
     model.train(1, 8)
-    assert seen == [8, 24]
+    assert seen == [8, 8, 16]
 
 
 @pytest.mark.parametrize("off", [{"shift_pixels": 0}, {"intensity_scale": 0.0}, {}])

@@ -4,22 +4,26 @@ import io
 import pathlib
 from abc import abstractmethod
 from collections.abc import Callable
+from math import ceil
 from typing import NamedTuple, TypeVar
 
 import torch as th
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
-from sb3_eqr.common.augmentations import ImageAugmentation
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.eqr_setup import EqRSetup
 from sb3_eqr.common.layers import Whitening
+from sb3_eqr.common.preprocessing import ImageAugmentation
 from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.transfer import load_representation, representation
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
+
+
+_PIECE = 2 << 20  # numbers in the observations of one pass on a CPU: 8 MiB as floats, 74 stacks of Atari frames
 
 
 class TDLoss(NamedTuple):
@@ -141,31 +145,23 @@ class EqRAlgorithm(EqRSetup):
 
     def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss | None, LatentLosses]:
         """
-        One features pass for s_t serves both; one target pass covers every other observation.
+        One features pass for s_t serves both.
 
         :return: losses per sample; no TD loss where it is off
         """
         policy = self.policy
         observations = self._augment(samples.observations)
         features = policy.online.encode(observations)  # (B, D)
-        others = [samples.next_observations] if self.td_coef > 0 else []
-        n_next = len(samples.actions) if self.td_coef > 0 else 0
-        if samples.rollout_observations is not None and self._uses_aet:
-            others.append(_map(lambda obs: obs.flatten(0, 1), samples.rollout_observations))  # (B * M, ...)
-        with th.no_grad():
-            other_observations = self._augment(_cat(others)) if others else observations
-            other_features = policy.target.encode(other_observations) if others else features[:0]  # (B + B * M, D)
-            next_target = next_online = other_features[:n_next]
-            if n_next and self.double_q and not self._target_is_online:
-                next_online = policy.online.encode(_map(lambda obs: obs[:n_next], other_observations))
-        td = self._q_learning(samples, features, next_online, next_target) if n_next else None
+        td = self._q_learning(samples, features) if self.td_coef > 0 else None
         if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
             target_states = features.detach() if self._target_is_online else policy.target.encode(observations)
             target_states = target_states[:, None]
-            if self._uses_aet:
-                rollout = other_features[n_next:].unflatten(0, samples.mask.shape)  # (B, M, D)
+            if samples.rollout_observations is not None and self._uses_aet:
+                flat = _map(lambda obs: obs.flatten(0, 1), samples.rollout_observations)  # (B * M, ...)
+                pieces = [policy.target.encode(self._augment(piece)) for piece in self._pieces(flat)]
+                rollout = th.cat(pieces).unflatten(0, samples.mask.shape)  # (B, M, D)
                 target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         auxiliary = policy.latent_model(
             features,
@@ -179,17 +175,34 @@ class EqRAlgorithm(EqRSetup):
         )
         return td, auxiliary
 
-    def _q_learning(
-        self, samples: SequenceReplayBufferSamples, features: th.Tensor, next_online: th.Tensor, next_target: th.Tensor
-    ) -> TDLoss:
+    def _pieces(self, observations: PyTorchObs) -> list[PyTorchObs]:
+        """
+        What a pass without gradient takes at a time: on a CPU so much as its caches hold, in blocks of memory that the C
+        library keeps, whatever M; elsewhere everything.
+
+        :param observations: (N, ...)
+        """
+        if self.device.type != "cpu":
+            return [observations]
+        tensors = list(observations.values()) if isinstance(observations, dict) else [observations]
+        n_pieces = ceil(sum(tensor.numel() for tensor in tensors) / _PIECE)
+        at_a_time = ceil(len(tensors[0]) / n_pieces)
+        if isinstance(observations, dict):
+            pieces = zip(*(tensor.split(at_a_time) for tensor in tensors), strict=True)
+            return [dict(zip(observations, piece, strict=True)) for piece in pieces]
+        return list(observations.split(at_a_time))
+
+    def _q_learning(self, samples: SequenceReplayBufferSamples, features: th.Tensor) -> TDLoss:
         """
         :param samples: the batch
         :param features: of s_t, online, (B, D)
-        :param next_online: of the n-step transition's last observation, online, no gradient, (B, D): double Q chooses by it
-        :param next_target: the same from the target, (B, D)
         """
         online, target = self.policy.online, self.policy.target
         with th.no_grad():
+            next_observations = self._augment(samples.next_observations)
+            next_target = next_online = target.encode(next_observations)  # (B, D)
+            if self.double_q and not self._target_is_online:
+                next_online = online.encode(next_observations)
             next_outputs = target.head(next_target, noisy=True)  # (B, N, A)
             chooser = online.head(next_online, noisy=True) if self.double_q else next_outputs
             next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
@@ -301,9 +314,3 @@ def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -
     if isinstance(observations, dict):
         return {key: function(obs) for key, obs in observations.items()}
     return function(observations)
-
-
-def _cat(observations: list[PyTorchObs]) -> PyTorchObs:
-    if isinstance(observations[0], dict):
-        return {key: th.cat([obs[key] for obs in observations]) for key in observations[0]}  # type: ignore[index, call-overload]
-    return th.cat(observations)  # type: ignore[arg-type]

@@ -148,7 +148,9 @@ class EqRArguments(SafeFiles):
         policy_kwargs = dict(policy_kwargs or {})
         policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
         if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, **(policy_kwargs.get("optimizer_kwargs") or {})}  # Table 5
+            # Epsilon of Table 5; one kernel for all parameters, on CPU and GPU, where PyTorch's default has six for each.
+            given = policy_kwargs.get("optimizer_kwargs") or {}
+            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, "fused": not given.get("foreach"), **given}
         super().__init__(  # type: ignore[call-arg]
             policy,
             env,

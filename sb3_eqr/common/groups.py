@@ -9,6 +9,7 @@ import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import cache
 from math import prod
 
 import torch as th
@@ -180,8 +181,13 @@ class SE(MatrixGroup):
 
     def _assemble(self, rotation: th.Tensor, translation: th.Tensor) -> th.Tensor:
         top = th.cat([rotation, translation], dim=-1)  # (..., n, n + 1)
-        bottom = th.eye(self.n + 1, dtype=top.dtype, device=top.device)[-1:].expand(*top.shape[:-2], 1, self.n + 1)
-        return th.cat([top, bottom], dim=-2)
+        return th.cat([top, _bottom_row(self.n, top.dtype, top.device).expand(*top.shape[:-2], 1, self.n + 1)], dim=-2)
+
+
+@cache
+def _bottom_row(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
+    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+        return th.eye(n + 1, dtype=dtype)[-1:].to(device)
 
 
 class T(Group):

@@ -122,9 +122,9 @@ class LatentModel(nn.Module):
         :return: x̂_1 ... x̂_M, (B, M, D)
         """
         states = []
-        for m in range(one_hot.shape[1]):  # each step needs the one before
-            moved = self.act(self.action_element(state, one_hot[:, m]), state)
-            state = th.where(mask[:, m, None] > 0, moved, state)
+        goes_on = (mask > 0)[:, :, None]  # (B, M, 1)
+        for action, moves in zip(one_hot.unbind(1), goes_on.unbind(1), strict=True):  # each step needs the one before
+            state = th.where(moves, self.act(self.action_element(state, action), state), state)
             states.append(state)
         return th.stack(states, dim=1)
 

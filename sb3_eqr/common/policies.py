@@ -18,7 +18,7 @@ from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.features_extractor import DEFAULT_GROUP, GroupFeaturesExtractor, ImageExtractor, find_trunk
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
-from sb3_eqr.common.layers import NoisyLinear
+from sb3_eqr.common.layers import ConvTrunk, NoisyLinear
 from sb3_eqr.common.networks import EqRNetwork
 from sb3_eqr.common.type_aliases import PyTorchObs
 
@@ -221,6 +221,9 @@ class EqRPolicy(BasePolicy):
             self.own_projection = nn.Linear(encoder.features_dim, self.latent_hidden_dim).to(self.device)
             self.own_projection_target = _frozen_copy(self.own_projection)
             parameters += self.own_projection.parameters()
+        for module in self.modules():
+            if isinstance(module, ConvTrunk):
+                module.to_channels_last()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.add_param_group({"params": parameters})
         _decay_matrices_only(self)
@@ -312,6 +315,8 @@ class EqRPolicy(BasePolicy):
 
         :param mode: True for training
         """
+        if mode == self.training:
+            return  # SB3 asks at every step of an environment, and going through all modules takes a while
         super().set_training_mode(mode)
         self.latent_model.train(mode)
         for module in self._frozen:

@@ -19,7 +19,10 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :param angles: radians, (..., n(n-1)/2)
     :return: (..., n, n)
     """
-    cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # (..., planes, 1)
+    cos, sin = angles.cos(), angles.sin()  # (..., planes)
+    if n == 2:  # one plane: there is nothing to multiply
+        return th.cat([cos, sin, -sin, cos], dim=-1).unflatten(-1, (2, 2))
+    cos, sin = cos[..., None], sin[..., None]
     columns = list(th.eye(n, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], n, n).unbind(-1))
     for plane, (i, j) in enumerate(_planes(n)):  # multiplying by R^{ij} from the right mixes columns i and j
         c, s = cos[..., plane, :], sin[..., plane, :]
@@ -40,10 +43,11 @@ def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
 
 @cache
 def _skew_basis(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
-    basis = th.zeros(n * (n - 1) // 2, n, n, dtype=dtype)
-    for d, (i, j) in enumerate(_planes(n)):
-        basis[d, i, j], basis[d, j, i] = 1.0, -1.0
-    return basis.to(device)
+    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+        basis = th.zeros(n * (n - 1) // 2, n, n, dtype=dtype)
+        for d, (i, j) in enumerate(_planes(n)):
+            basis[d, i, j], basis[d, j, i] = 1.0, -1.0
+        return basis.to(device)
 
 
 def _planes(n: int) -> list[tuple[int, int]]:
