@@ -1,6 +1,7 @@
 """One run of a benchmark: its protocol, its checkpoints, what it writes."""
 
 import json
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -10,14 +11,14 @@ from filelock import FileLock
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr.benchmark import recording
+from sb3_eqr.benchmark import evaluation, recording
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.checkpoints import find_checkpoints, pickle_environment, restore_environment
-from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
+from sb3_eqr.benchmark.evaluation import EpsilonGreedy, GamesInTurn, evaluate, fits_atari_batch, make_evaluation_env
 from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.envs import atari, make_atari100k_env
+from sb3_eqr.envs import atari, atari_batch, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 
 STEPS = 400
@@ -254,6 +255,110 @@ def test_an_endless_atari_game_is_counted_when_its_steps_are_over(monkeypatch):
     suite = choose(load_suite("atari100k-5"), ["Boxing"], None)
     _, lengths = evaluate(Fixed(), suite.protocol("Boxing"), 20, seed=0)
     assert lengths == [50] * 20
+
+
+class Counting(Fixed):
+    """An agent that counts the observations it was asked about."""
+
+    n_seen = 0
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert observation.shape[1:] == (84, 84, 4) and episode_start.shape == (len(observation),)
+        self.n_seen += len(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+
+def random_breakout(n_envs=3):
+    found = choose(load_suite("atari100k"), ["Breakout"], None).protocol("Breakout")
+    found["evaluation"] |= {"n_envs": n_envs, "epsilon": 1.0}
+    return found
+
+
+def test_no_thought_is_given_to_atari_games_that_have_had_their_share():
+    """Random play of Breakout lasts some 120 to 300 steps; the agent is asked once for each step that is counted."""
+    agent, state = Counting(), np.random.get_state()[1].copy()
+    scores, lengths = evaluate(agent, random_breakout(), 5, seed=0)
+    assert len(scores) == len(lengths) == 5 and agent.n_seen == sum(lengths) and len(set(lengths)) > 1
+    assert all(100 < length < 500 for length in lengths) and 0 < sum(scores) < 50
+    assert (np.random.get_state()[1] == state).all()
+    assert evaluate(agent, random_breakout(), 5, seed=0) == (scores, lengths) != evaluate(agent, random_breakout(), 5, seed=1)
+
+
+class Scripted:
+    """A batch of games of given lengths, over and over; every step scores 1 in the first game, 10 in the second, ..."""
+
+    def __init__(self, lengths):
+        self.lengths, self.n_envs = np.array(lengths), len(lengths)
+        self.sent = []
+
+    def reset(self):
+        self.step = 0
+        return np.zeros((self.n_envs, 1))
+
+    def send(self, actions):
+        self.sent.append(actions)
+
+    def receive(self):
+        self.step += 1
+        return np.full((self.n_envs, 1), self.step), 10.0 ** np.arange(self.n_envs), self.step % self.lengths == 0
+
+
+class Recurrent(Fixed):
+    """An agent whose state is the number of steps since the episode began, per game; its action is 7."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        count = np.zeros(len(observation)) if state is None else state[0]
+        self.count = np.where(episode_start, 0, count) + 1
+        return np.full(len(observation), 7), (self.count,)
+
+
+def play_scripted(agent, shares):
+    batch = Scripted([2, 3, 6])
+    games = GamesInTurn(batch, EpsilonGreedy(agent, 0.0, Corridor.action_space, 0), np.array(shares))
+    ended = []
+    while games.playing:
+        games.act()
+        ended += games.see()
+    return batch, ended
+
+
+def test_each_game_of_a_batch_plays_its_share():
+    batch, ended = play_scripted(Fixed(), [4, 1, 2])
+    assert ended == [(2.0, 2), (30.0, 3), (2.0, 2), (2.0, 2), (600.0, 6), (2.0, 2), (600.0, 6)]
+    assert len(batch.sent) == 12
+    assert play_scripted(Fixed(), [1, 0, 0])[1] == [(2.0, 2)]
+
+
+def test_a_recurrent_agent_keeps_a_state_for_each_game_of_a_batch():
+    agent = Recurrent()
+    batch, ended = play_scripted(agent, [1, 1, 2])
+    assert ended == [(2.0, 2), (30.0, 3), (600.0, 6), (600.0, 6)]
+    assert all(actions.tolist() == [7, 7, 7] for actions in batch.sent)
+    assert agent.count.tolist() == [2, 3, 6]  # at the twelfth step
+
+
+def test_which_protocol_an_atari_batch_fits(monkeypatch):
+    fitting = random_breakout()
+    assert fits_atari_batch(fitting, Fixed())
+    assert not fits_atari_batch(protocol(), Fixed())
+    assert not fits_atari_batch(fitting | {"env_id": "ALE/Breakout-v5"}, Fixed())  # made with frame skip, sticky actions
+    assert not fits_atari_batch(fitting | {"preprocessing": {"env_kwargs": {"full_action_space": True}}}, Fixed())
+    other = fitting["evaluation"] | {"preprocessing": {"env_wrapper": "my.Wrapper", "frame_stack": 4}}
+    assert not fits_atari_batch(fitting | {"evaluation": other}, Fixed())
+    normalised = Fixed()
+    normalised.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=True)
+    assert not fits_atari_batch(fitting, normalised)
+    normalised.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=False)
+    assert fits_atari_batch(fitting, normalised)
+    monkeypatch.setattr(atari_batch, "version", lambda name: "0.11.2")
+    assert not fits_atari_batch(fitting, Fixed())
+
+
+def test_atari_is_evaluated_without_a_batch_where_ale_has_none(monkeypatch):
+    monkeypatch.setattr(atari, "MAX_STEPS", 40)
+    monkeypatch.setattr(evaluation, "has_atari_batch", lambda: False)
+    monkeypatch.setattr(evaluation, "AtariBatch", None)
+    assert evaluate(Fixed(), random_breakout(n_envs=2), 4, seed=0)[1] == [40] * 4
 
 
 @pytest.mark.parametrize("game", ["Breakout", "Seaquest"])

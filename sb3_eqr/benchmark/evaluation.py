@@ -15,8 +15,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
+from sb3_eqr.envs.atari_batch import AtariBatch, has_atari_batch
 
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation plays other games than training, and than that of another seed
+# What AtariBatch plays: the wrapper of the suite atari100k, for evaluation.
+WHOLE_ATARI_GAMES = {"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}], "frame_stack": 4}
+N_TURNS = 2  # batches: while the emulator plays one, the agent acts in the other
 
 
 class EpsilonGreedy:
@@ -119,6 +123,54 @@ def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: in
     return VecFrameStack(env, n_stack) if n_stack else env
 
 
+class GamesInTurn:
+    """
+    The games of one batch and the agent that plays them, until each game has been played as often as it should.
+
+    :param batch: of games
+    :param player: the agent
+    :param shares: number of episodes of each game, (n_envs,)
+    """
+
+    def __init__(self, batch: AtariBatch, player: EpsilonGreedy, shares: np.ndarray):
+        self._batch = batch
+        self._player = player
+        self._left = shares.copy()
+        self._scores = np.zeros(batch.n_envs)
+        self._lengths = np.zeros(batch.n_envs, dtype=int)
+        self._observations = batch.reset()
+        self._starts = np.ones(batch.n_envs, dtype=bool)
+        self._state: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def playing(self) -> bool:
+        """Whether an episode is left."""
+        return bool(self._left.any())
+
+    def act(self) -> None:
+        """Choose actions and let the emulator go on with them; it does so while Python goes on, too."""
+        # No thoughts on games that have had their share, but a recurrent agent keeps a state for each.
+        chosen = np.flatnonzero(self._left) if self._state is None else np.arange(self._batch.n_envs)
+        actions = np.zeros(self._batch.n_envs, dtype=int)
+        actions[chosen], self._state = self._player.predict(self._observations[chosen], self._state, self._starts[chosen])
+        self._batch.send(actions)
+
+    def see(self) -> list[tuple[float, int]]:
+        """
+        Wait for the emulator.
+
+        :return: score and length of each episode that has ended, in its share
+        """
+        self._observations, rewards, self._starts = self._batch.receive()
+        self._scores += rewards
+        self._lengths += 1
+        counted = np.flatnonzero(self._starts & (self._left > 0))
+        ended = [(float(self._scores[i]), int(self._lengths[i])) for i in counted]
+        self._left[counted] -= 1
+        self._scores[self._starts], self._lengths[self._starts] = 0.0, 0
+        return ended
+
+
 def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
     Scores and lengths of whole episodes. Every environment plays its share of them and no more, so that short episodes are
@@ -130,12 +182,68 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     :param seed: of the run
     """
     before = get_rng_state(model.action_space)
-    env = make_evaluation_env(protocol, model, FIRST_SEED + SEEDS * seed)
+    play = play_atari if fits_atari_batch(protocol, model) else play_environments
     try:
-        player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, FIRST_SEED + SEEDS * seed)
+        scores, lengths = play(model, protocol, n_episodes, FIRST_SEED + SEEDS * seed)
+    finally:
+        set_rng_state(before, model.action_space)
+    return [float(score) for score in scores], [int(length) for length in lengths]
+
+
+def play_environments(
+    model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int
+) -> tuple[list[float], list[int]]:
+    """
+    Any environments, one after the other in one process. See :func:`evaluate`.
+
+    :param seed: of the first environment
+    """
+    env = make_evaluation_env(protocol, model, seed)
+    try:
+        player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
         scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)  # type: ignore[arg-type]
     finally:
         env.close()
-        set_rng_state(before, model.action_space)
     assert isinstance(scores, list) and isinstance(lengths, list)
-    return [float(score) for score in scores], [int(length) for length in lengths]
+    return scores, lengths
+
+
+def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
+    """
+    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :param model: the agent
+    :return: whether ``AtariBatch`` shows the agent what the protocol says
+    """
+    trained = model.get_vec_normalize_env()
+    return (
+        protocol["env_id"].endswith("NoFrameskip-v4")
+        and preprocessing_of(protocol) == WHOLE_ATARI_GAMES
+        and not (trained is not None and trained.norm_obs)
+        and has_atari_batch()
+    )
+
+
+def play_atari(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
+    """
+    Atari by :data:`WHOLE_ATARI_GAMES`, in two batches that take turns: while the emulator plays one, the agent acts in the
+    other. See :func:`evaluate`.
+
+    :param seed: of the first game
+    """
+    settings = protocol["evaluation"]
+    n_envs = min(settings["n_envs"], n_episodes)
+    shares = (n_episodes + np.arange(n_envs)) // n_envs
+    turns: list[GamesInTurn] = []
+    for indices in np.array_split(np.arange(n_envs), min(N_TURNS, n_envs)):
+        first = seed + int(indices[0])
+        batch = AtariBatch(protocol["env_id"], len(indices), first, settings["max_steps"])
+        turns.append(GamesInTurn(batch, EpsilonGreedy(model, settings["epsilon"], batch.action_space, first), shares[indices]))
+        turns[-1].act()
+    ended: list[tuple[float, int]] = []
+    while turns:
+        for games in turns:
+            ended += games.see()
+            if games.playing:
+                games.act()
+        turns = [games for games in turns if games.playing]
+    return [score for score, _ in ended], [length for _, length in ended]
