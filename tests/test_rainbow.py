@@ -167,7 +167,8 @@ def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
     def watched(positions, envs, *args):
         samples = gather(positions, envs, *args)
         used.append((model._n_updates, buffer.n_steps, buffer.gamma))
-        for position, found, discount in zip(positions, samples.rewards[:, 0], samples.discounts[:, 0], strict=True):
+        pairs = zip(positions, samples["rewards"][:, 0], samples["discounts"][:, 0], strict=True)
+        for position, found, discount in pairs:
             total, power = 0.0, 1.0
             for step in range(buffer.n_steps):
                 total += power * buffer.rewards[position + step, 0]
@@ -368,7 +369,7 @@ def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
     monitor.start_round(1)
     before = optimizer.state[layer.weight]["exp_avg"].clone()
     optimizer.state.clear()
-    monitor.add({"loss": th.tensor(float("nan"))})
+    monitor.add(["loss"], th.tensor([float("nan")]))
     with pytest.raises(FloatingPointError):
         monitor.collect()
     assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2

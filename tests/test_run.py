@@ -411,8 +411,9 @@ def test_vec_normalize(make):
     env = VecNormalize(make_vec_env(ChainEnv, 2))
     model = make(env).learn(100)
     samples = model.replay_buffer.sample(50, env=env)
-    raw = model.replay_buffer._observations(*np.divmod(samples.indices, 2), None)
-    np.testing.assert_allclose(samples.observations, env.normalize_obs(raw.numpy()), rtol=1e-6)
+    store = model.replay_buffer._stores[""]
+    raw = store.observations(store.ids(*np.divmod(samples.indices, 2)))
+    np.testing.assert_allclose(samples.observations, env.normalize_obs(raw), rtol=1e-6)
     assert samples.rollout_rewards.abs().max() <= env.clip_reward
     model.learn(20, reset_num_timesteps=False)
 
@@ -473,7 +474,7 @@ def test_logged_figures_are_means_over_the_updates_since_the_last_dump(make):
     for values in ((1.0, 3.0), (5.0, 7.0)):
         model._monitor.start_round(0)
         for value in values:
-            model._monitor.add({"loss": th.tensor(value), "grad_norm": th.tensor(value + 1)})
+            model._monitor.add(["loss", "grad_norm"], th.tensor([value, value + 1]))
         model._collect_metrics()
     logged = model.logger.name_to_value
     assert (logged["train/loss"], logged["train/grad_norm"]) == (4.0, 5.0)

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.frame_store import FrameStore
+from sb3_eqr.common.frame_buffer import FrameReplayBuffer
 from sb3_eqr.common.sum_tree import SumTree
-from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
+from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 try:
     import psutil
@@ -20,7 +20,7 @@ except ImportError:
     psutil = None  # type: ignore[assignment]
 
 
-class SequenceReplayBuffer(ReplayBuffer):
+class SequenceReplayBuffer(FrameReplayBuffer):
     """
     Uniform replay of n-step transitions with M-step rollouts.
 
@@ -72,12 +72,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.prediction_depth = prediction_depth
         self._check_arguments(frame_stack)
 
-        obs_spaces = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-        shapes = self.obs_shape if isinstance(self.obs_shape, dict) else {"": self.obs_shape}
-        self._stores = {
-            key: FrameStore(self.buffer_size, n_envs, shapes[key], space.dtype, frame_stack)  # type: ignore[arg-type]
-            for key, space in obs_spaces.items()
-        }
+        self._make_stores(frame_stack)
         shape = (self.buffer_size, n_envs)
         self.actions = np.zeros((*shape, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
         self.rewards = np.zeros(shape, dtype=np.float32)
@@ -170,17 +165,6 @@ class SequenceReplayBuffer(ReplayBuffer):
             self.full = True
             self.pos = 0
 
-    def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
-        shape = (self.n_envs, *store.obs_shape)
-        if obs.shape == shape[:1]:  # Discrete
-            return obs.reshape(shape)
-        if obs.shape != shape:
-            raise ValueError(
-                f"observations: expected the shape {shape} of the replay buffer, found {obs.shape}. "
-                "Wrappers that change the shape (VecTransposeImage, VecFrameStack) belong inside VecNormalize."
-            )
-        return obs
-
     def reset(self) -> None:
         """Forget everything."""
         super().reset()
@@ -193,9 +177,26 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param env: normalises observations and one-step rewards, where given
         :return: B windows, drawn uniformly from NumPy's global generator (which ``set_random_seed`` seeds)
         """
-        if self.prediction_depth == 0:
-            return super().sample(batch_size, env)  # type: ignore[return-value]
-        return self._get_samples(self._positions(np.random.randint(0, self.n_starts, size=batch_size)), env)
+        return self._samples(self.draw(batch_size, env), env)
+
+    def draw(self, batch_size: int, env: VecNormalize | None = None) -> dict[str, np.ndarray]:
+        """
+        What :meth:`sample` returns, in small arrays: observations by the indices of their frames.
+
+        :param batch_size: B
+        :param env: normalises one-step rewards, where given
+        :return: the fields of :class:`~sb3_eqr.common.type_aliases.SequenceReplayBufferSamples`; of an observation, one array
+            per key, ``"observations/<key>"``, (B, n_stack), int32
+        """
+        if self.prediction_depth == 0:  # SB3's own draws
+            positions = np.random.randint(0, self.size(), size=batch_size)
+        else:
+            positions = self._positions(np.random.randint(0, self.n_starts, size=batch_size))
+        return self._gather(positions, np.random.randint(0, self.n_envs, size=batch_size), env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
+        envs = np.random.randint(0, self.n_envs, size=batch_inds.shape)
+        return self._samples(self._gather(batch_inds, envs, env), env)
 
     @property
     def n_starts(self) -> int:
@@ -210,20 +211,16 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param envs: environments, (B,)
         :param env: normalises observations and one-step rewards, where given
         """
-        return self._gather(self._positions(starts), envs, env)
+        return self._samples(self._gather(self._positions(starts), envs, env), env)
 
     def _positions(self, starts: np.ndarray) -> np.ndarray:
         return (starts + (self.pos if self.full else 0)) % self.buffer_size  # from the oldest on
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
-        env_indices = np.random.randint(0, self.n_envs, size=batch_inds.shape)
-        return self._gather(batch_inds, env_indices, env)
-
     def _gather(
         self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, weights: np.ndarray | None = None
-    ) -> SequenceReplayBufferSamples:
+    ) -> dict[str, np.ndarray]:
         """
-        The windows that start at ``positions`` of ``envs``.
+        The windows that start at ``positions`` of ``envs``, see :meth:`draw`.
 
         :param positions: (B,)
         :param envs: (B,)
@@ -249,42 +246,28 @@ class SequenceReplayBuffer(ReplayBuffer):
         last = (positions + last_step) % self.buffer_size
         dones = (self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None]  # (B, 1)
 
-        samples = SequenceReplayBufferSamples(
-            observations=self._observations(positions, envs, env),
-            actions=self._tensor(self.actions[positions, envs]),
-            next_observations=self._observations(last, envs, env, after=True),
-            dones=self._tensor(dones),
-            rewards=self._tensor(returns.astype(np.float32, copy=False)),
-            discounts=self._tensor(discounts.astype(np.float32, copy=False)),
-            indices=positions * self.n_envs + envs,
-            weights=self._tensor(np.ones(len(positions), dtype=np.float32) if weights is None else weights),
-        )
+        arrays = {
+            "actions": self.actions[positions, envs],
+            "dones": dones,
+            "rewards": returns.astype(np.float32, copy=False),
+            "discounts": discounts.astype(np.float32, copy=False),
+            "indices": positions * self.n_envs + envs,
+            "weights": np.ones(len(positions), dtype=np.float32) if weights is None else weights,
+        }
+        for key, store in self._stores.items():
+            arrays[f"observations/{key}"] = store.ids(positions, envs)
+            arrays[f"next_observations/{key}"] = store.next_ids(last, envs)
         if depth == 0:
-            return samples
+            return arrays
         mask = steps[:depth] <= first_end[:, None]  # (B, M)
         # Beyond the end, the last transition is repeated: nothing of another episode gets in, masked or not.
         rollout = (positions[:, None] + np.minimum(steps[:depth], first_end[:, None])) % self.buffer_size
-        return samples._replace(
-            rollout_observations=self._observations(rollout, columns, env, after=True),
-            rollout_actions=self._tensor(self.actions[rollout, columns, 0]),
-            rollout_rewards=self._tensor((rewards[:, :depth] * mask).astype(np.float32, copy=False)),
-            mask=self._tensor(mask.astype(np.float32)),
-        )
-
-    def _observations(
-        self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, after: bool = False
-    ) -> PyTorchObs:
-        found = {
-            key: (store.next_observations if after else store.observations)(positions, envs)
-            for key, store in self._stores.items()
-        }
-        if isinstance(self.observation_space, spaces.Dict):
-            normalized = self._normalize_obs(found, env)
-            return {key: self._tensor(obs) for key, obs in normalized.items()}  # type: ignore[union-attr]
-        return self._tensor(self._normalize_obs(found[""], env))  # type: ignore[arg-type]
-
-    def _tensor(self, array: np.ndarray) -> th.Tensor:
-        return th.as_tensor(array, device=self.device)  # arrays here are fresh copies already
+        arrays["rollout_actions"] = self.actions[rollout, columns, 0]
+        arrays["rollout_rewards"] = (rewards[:, :depth] * mask).astype(np.float32, copy=False)
+        arrays["mask"] = mask.astype(np.float32)
+        for key, store in self._stores.items():
+            arrays[f"rollout_observations/{key}"] = store.next_ids(rollout, columns)
+        return arrays
 
 
 class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
@@ -357,12 +340,8 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         self._set_ages(0, 1, 0.0)  # what was overwritten
         self._set_ages(self._tree_window - 1, self._tree_window, self._max_priority)
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
-        """
-        :param batch_size: B
-        :param env: normalises observations and one-step rewards, where given
-        :return: B windows, stratified by priority; ``indices`` goes back into :meth:`update_priorities`
-        """
+    def draw(self, batch_size: int, env: VecNormalize | None = None) -> dict[str, np.ndarray]:
+        """As :class:`SequenceReplayBuffer` does, stratified by priority; ``indices`` is for :meth:`update_priorities`."""
         self._follow_window()
         leaves = self._tree.sample(batch_size, np.random.random_sample(batch_size))
         priorities = self._tree.get(leaves)

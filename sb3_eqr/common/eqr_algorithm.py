@@ -7,18 +7,20 @@ from collections.abc import Callable
 from math import ceil
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-from sb3_eqr.common.eqr_setup import EqRSetup
 from sb3_eqr.common.layers import Whitening
+from sb3_eqr.common.networks import EqRNetwork
 from sb3_eqr.common.preprocessing import ImageAugmentation
 from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.transfer import load_representation, representation
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
+from sb3_eqr.common.update_rounds import UpdateRounds
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
@@ -34,7 +36,7 @@ class TDLoss(NamedTuple):
     q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
 
 
-class EqRAlgorithm(EqRSetup):
+class EqRAlgorithm(UpdateRounds):
     """
     Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
     one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
@@ -68,13 +70,11 @@ class EqRAlgorithm(EqRSetup):
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """
-        :param gradient_steps: number of updates
-        :param batch_size: B
-        """
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         buffer = self.replay_buffer
         assert buffer is not None
+        captures = self._captures()
+        self._late.write_back()
         self._collect_metrics()
         remaining = self._current_progress_remaining
         if isinstance(buffer, PrioritizedSequenceReplayBuffer):
@@ -89,7 +89,11 @@ class EqRAlgorithm(EqRSetup):
             self._set_window(buffer)
             if not buffer.can_sample():
                 break  # the first window is not complete yet
-            self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
+            self._late.write_back(but=1)
+            if captures:
+                self._run_captured(buffer.draw(batch_size))
+            else:
+                self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
         if self.reset_interval is not None:
             self.logger.record("train/n_resets", len(self._resets))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -113,12 +117,21 @@ class EqRAlgorithm(EqRSetup):
         return self.reset_interval is not None and self._updates_since_reset >= self.reset_interval and not over
 
     def _reset(self) -> None:
+        self._captured.forget()
         self.policy.reset_parameters(self._make_policy(), self.reset_shrink_factor)
         self._target_is_copy = True
         self._resets.append(self._n_updates)
 
     def _update(self, samples: SequenceReplayBufferSamples) -> None:
         """One gradient step, the target, the priorities."""
+        self._record(samples.indices, self._update_networks(samples))
+
+    def _update_networks(self, samples: SequenceReplayBufferSamples) -> dict[str, th.Tensor]:
+        """
+        All of an update that the device does.
+
+        :return: "figures", what the monitor shows, and new "priorities", (B,), where there is a TD loss
+        """
         td, auxiliary = self._compute_losses(samples)
         parts = {"td": None if td is None else td.loss, **auxiliary._asdict()}
         weighted = [getattr(self, f"{name}_coef") * part for name, part in parts.items() if part is not None]
@@ -129,19 +142,31 @@ class EqRAlgorithm(EqRSetup):
         max_norm = float("inf") if self.max_grad_norm is None else self.max_grad_norm
         grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
         self.policy.optimizer.step()
-        self._n_updates += 1
-        self._target_is_copy = False
         if self.target_update_interval is None:
             self.policy.update_target(self.tau)
-            self._target_is_copy = self.tau == 1.0
-        if td is not None and isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
-            self.replay_buffer.update_priorities(samples.indices, td.priorities)
         with th.no_grad():
             figures = {f"{name}_loss": part.mean() for name, part in parts.items() if part is not None}
             figures.update(loss=loss, grad_norm=grad_norm)
             if td is not None:
                 figures["mean_q_value"] = td.q_values.mean()
-            self._monitor.add(figures)
+            self._figure_names = list(figures)
+            stacked = th.stack(list(figures.values()))
+        return {"figures": stacked} if td is None else {"figures": stacked, "priorities": td.priorities}
+
+    def _record(self, indices: np.ndarray, outputs: dict[str, th.Tensor]) -> None:
+        """
+        All of an update that the host does.
+
+        :param indices: of the samples in the replay buffer, (B,)
+        :param outputs: of :meth:`_update_networks`
+        """
+        self._n_updates += 1
+        self._target_is_copy = self.target_update_interval is None and self.tau == 1.0
+        self._monitor.add(self._figure_names, outputs["figures"])
+        if "priorities" in outputs and isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
+            self._late.add(self.replay_buffer, indices, outputs["priorities"])
+            if self.fast != "overlap":
+                self._late.write_back()
 
     def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss | None, LatentLosses]:
         """
@@ -151,16 +176,16 @@ class EqRAlgorithm(EqRSetup):
         """
         policy = self.policy
         observations = self._augment(samples.observations)
-        features = policy.online.encode(observations)  # (B, D)
+        features = self._encode(policy.online, observations)  # (B, D)
         td = self._q_learning(samples, features) if self.td_coef > 0 else None
         if samples.mask is None:
             return td, LatentLosses(None, None, None)
         with th.no_grad():
-            target_states = features.detach() if self._target_is_online else policy.target.encode(observations)
+            target_states = features.detach() if self._target_is_online else self._encode(policy.target, observations)
             target_states = target_states[:, None]
             if samples.rollout_observations is not None and self._uses_aet:
                 flat = _map(lambda obs: obs.flatten(0, 1), samples.rollout_observations)  # (B * M, ...)
-                pieces = [policy.target.encode(self._augment(piece)) for piece in self._pieces(flat)]
+                pieces = [self._encode(policy.target, self._augment(piece)) for piece in self._pieces(flat)]
                 rollout = th.cat(pieces).unflatten(0, samples.mask.shape)  # (B, M, D)
                 target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         auxiliary = policy.latent_model(
@@ -174,6 +199,12 @@ class EqRAlgorithm(EqRSetup):
             policy.target_project,
         )
         return td, auxiliary
+
+    def _encode(self, network: EqRNetwork, observations: PyTorchObs) -> th.Tensor:
+        if not self.bf16:
+            return network.encode(observations)
+        with th.autocast(self.device.type, th.bfloat16, cache_enabled=False):
+            return network.encode(observations).float()
 
     def _pieces(self, observations: PyTorchObs) -> list[PyTorchObs]:
         """
@@ -200,9 +231,9 @@ class EqRAlgorithm(EqRSetup):
         online, target = self.policy.online, self.policy.target
         with th.no_grad():
             next_observations = self._augment(samples.next_observations)
-            next_target = next_online = target.encode(next_observations)  # (B, D)
+            next_target = next_online = self._encode(target, next_observations)  # (B, D)
             if self.double_q and not self._target_is_online:
-                next_online = online.encode(next_observations)
+                next_online = self._encode(online, next_observations)
             next_outputs = target.head(next_target, noisy=True)  # (B, N, A)
             chooser = online.head(next_online, noisy=True) if self.double_q else next_outputs
             next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
@@ -237,7 +268,8 @@ class EqRAlgorithm(EqRSetup):
     ) -> SelfEqRAlgorithm:
         """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
         tb_log_name = tb_log_name or type(self).__name__
-        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        with self._rounds_may_wait():
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._collect_metrics()
         return self
 
@@ -250,6 +282,7 @@ class EqRAlgorithm(EqRSetup):
             self._n_updates = error.n_updates
             self._resets = [reset for reset in self._resets if reset < error.n_updates]  # later ones were put back, too
             self._target_is_copy = False
+            self._captured.forget()
             raise
 
     def dump_logs(self) -> None:
@@ -262,6 +295,7 @@ class EqRAlgorithm(EqRSetup):
     ) -> None:
         """As SB3's ``set_parameters``, with the same parameters."""
         self._target_is_copy = False  # nothing is known of them
+        self._captured.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def load_representation(
@@ -281,6 +315,7 @@ class EqRAlgorithm(EqRSetup):
                 "freeze: expected a loss that trains something else, found td_coef=0 and no reward loss. Pass freeze=False."
             )
         self._collect_metrics()
+        self._captured.forget()
         load_representation(self.policy, path)
         self.representation_frozen = freeze
         self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
@@ -288,6 +323,7 @@ class EqRAlgorithm(EqRSetup):
         return self
 
     def _before_saving(self) -> None:
+        self._late.write_back()
         self._collect_metrics()  # a model whose last update went wrong is put back and not saved
 
     def _excluded_save_params(self) -> list[str]:
@@ -298,6 +334,7 @@ class EqRAlgorithm(EqRSetup):
             "_encoder_ignores_mode",
             "_target_is_copy",
             "_augment",
+            "_figure_names",
         ]
 
 

@@ -11,6 +11,8 @@ from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.policies import EqRPolicy, find_optimizer
 from sb3_eqr.common.safe_files import SafeFiles
 
+FAST = ("auto", "off", "graph", "overlap")
+
 
 class EqRArguments(SafeFiles):
     """
@@ -69,6 +71,8 @@ class EqRArguments(SafeFiles):
         reset_interval: int | None = None,
         reset_shrink_factor: float = 0.5,
         reset_fraction: float = 0.9,
+        fast: str = "auto",
+        bf16: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -131,6 +135,12 @@ class EqRArguments(SafeFiles):
         :param reset_shrink_factor: α in [0, 1]: at a reset, encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF
         :param reset_fraction: fraction of the entire training period (as SB3 counts it for each call of ``learn``) after
             which there are no resets any more, so that the final agent has had time to recover
+        :param fast: how updates run. "auto": on a GPU captured as one CUDA graph, elsewhere as they are; "off": as they are;
+            "graph": captured, with a warning that says why where that cannot be; "overlap": captured, and the environments
+            step while the GPU computes: an action is chosen by the networks of one round of updates before, and priorities are
+            written one update late. The first three give the same numbers to rounding
+        :param bf16: in updates, the convolutions (or what else stands in front of the group encoder's linear layer) compute in
+            bfloat16, by autocast; for GPUs
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation, see
@@ -198,6 +208,9 @@ class EqRArguments(SafeFiles):
         self.reset_interval = reset_interval
         self.reset_shrink_factor = reset_shrink_factor
         self.reset_fraction = reset_fraction
+        self.fast = fast
+        self.bf16 = bf16
+        self._waiting_round: tuple[int, int] | None = None  # of updates, with fast="overlap"; survives saving
         self.representation_frozen = False  # by load_representation; survives saving
         self._resets: list[int] = []  # the number of updates before each reset so far
         if _init_setup_model:
@@ -218,6 +231,8 @@ class EqRArguments(SafeFiles):
         if self.initial_n_steps is not None:
             check_number("initial_n_steps", self.initial_n_steps, 1, whole=True)
         check_number("batch_size", self.batch_size, 1, whole=True)
+        if self.fast not in FAST:
+            raise ValueError(f"fast: expected one of {list(FAST)}, found {self.fast!r}")
         self._check_combinations()
 
     def _check_combinations(self) -> None:

@@ -67,13 +67,14 @@ class UpdateMonitor:
             th._foreach_copy_([*kept[0], *kept[1].values()], [*model, *(state[key] for key in kept[1])])
         self._start = Backup(n_updates, *kept)
 
-    def add(self, figures: dict[str, th.Tensor]) -> None:
+    def add(self, names: list[str], figures: th.Tensor) -> None:
         """
-        :param figures: of one update, scalars; the names are the same for all updates of a round
+        :param names: of the figures, the same for all updates of a round
+        :param figures: of one update, (len(names),)
         """
         self._has_updates = True
-        self._names = list(figures)
-        self._pending.append(th.stack(list(figures.values())))
+        self._names = names
+        self._pending.append(figures)
 
     def collect(self) -> dict[str, float]:
         """
