@@ -1,6 +1,8 @@
 """The fast ways of an update: captured, overlapped, in bfloat16. Those that need a GPU are checked as far as a CPU goes."""
 
 import contextlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -254,3 +256,35 @@ def test_captured_is_eager_on_a_gpu(make, policy):
     assert models[1]._captured.failure is None and models[0]._n_updates == models[1]._n_updates >= 100
     for a, b in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
         th.testing.assert_close(a, b, rtol=0, atol=1e-5)
+
+
+FAULTS = """
+import resource
+import statistics
+
+import torch as th
+from sb3_eqr.benchmark.speed.workload import EQR_AGENTS, make_trainable
+
+
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+
+th.set_num_threads(1)
+for depth in (5, 10):
+    model = make_trainable(EQR_AGENTS[0], prediction_depth=depth)
+    found = []
+    for _ in range(21):
+        before = faults()
+        model.train(1, 32)
+        found.append(faults() - before)
+    print(statistics.median(found))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="counts as Linux does")
+def test_an_update_of_atari_frames_takes_no_fresh_memory():
+    """In a process of its own, without settings for the C library. A page is 4 kB; such an update wrote 8,000 new ones."""
+    run = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    assert max(map(float, run.stdout.split())) < 100
