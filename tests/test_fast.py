@@ -1,16 +1,19 @@
 """The fast ways of an update: captured, overlapped, in bfloat16. Those that need a GPU are checked as far as a CPU goes."""
 
 import contextlib
+import copy
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
+from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.captured_update import CapturedUpdate, StaticInputs
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from tests.toys import ChainEnv, ImageEnv
@@ -54,7 +57,7 @@ def fake_cuda(monkeypatch):
                 assert all(group["capturable"] for group in self._optimizer.param_groups)
                 graph.function = lambda: self._function(recorded.inputs.tensors)
         except RuntimeError as error:
-            self.failure = str(error)
+            self.give_up(error)
             return
         recorded.graph = graph
 
@@ -66,12 +69,12 @@ def fake_cuda(monkeypatch):
         graph.replay = first
 
     monkeypatch.setattr(CapturedUpdate, "_capture", record)
-    monkeypatch.setattr(CapturedUpdate, "_warm_up", lambda self, recorded: self._function(recorded.inputs.tensors))
+    monkeypatch.setattr(CapturedUpdate, "_run", lambda self, recorded: self._function(recorded.inputs.tensors))
     return made, refuse
 
 
 def as_on_a_gpu(model, monkeypatch):
-    monkeypatch.setattr(model, "_captures", lambda: True)
+    monkeypatch.setattr(model, "_captures", lambda: model._captured.failure is None)
     return model
 
 
@@ -113,11 +116,75 @@ def test_what_changes_a_graph_is_captured_again(make, monkeypatch, fake_cuda):
     assert all(isinstance(g["lr"], float) and not g["capturable"] for g in captured.policy.optimizer.param_groups)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda model: model.policy.latent_model.transition.requires_grad_(False),  # as train_representation does for a while
+        lambda model: model.policy.freeze([model.policy.online.features_extractor]),
+        lambda model: setattr(model, "bf16", True),
+        lambda model: setattr(model, "tau", 0.5),
+        lambda model: setattr(model, "reward_coef", 0.0),
+        lambda model: model.policy.optimizer.load_state_dict(copy.deepcopy(model.policy.optimizer.state_dict())),
+        lambda model: setattr(model, "replay_buffer", copy.deepcopy(model.replay_buffer)),
+        lambda model: setattr(model.replay_buffer, "prediction_depth", 1),
+    ],
+)
+def test_what_a_graph_would_hold_fast_is_in_its_key(make, monkeypatch, fake_cuda, change):
+    """A real graph, unlike the fake one, would go on as it was."""
+    model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
+    model.replay_buffer.update_device_frames()
+
+    def key():
+        places = model.replay_buffer.update_device_frames()
+        return places, model._constants(), {k: a.shape for k, a in model.replay_buffer.draw(8).items()}
+
+    assert key() == key()
+    before = key()
+    change(model)
+    assert key() != before
+
+
+def test_few_graphs_are_kept(make, monkeypatch, fake_cuda):
+    model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
+    for coef in np.linspace(0.1, 1, 9):  # as a callback may anneal it
+        model.aet_coef = coef
+        model.train(1, 8)
+    assert len(model._captured._captures) == CapturedUpdate.KEPT
+
+
+def test_losses_that_come_and_go_keep_their_names(make, monkeypatch, fake_cuda):
+    model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
+    for get_coef, has_get in ((0.0, False), (1.0, True), (0.0, False)):
+        model.get_coef = get_coef
+        model.train(6, 8)
+        assert ("get_loss" in model._monitor.collect()) == has_get
+
+
 def test_what_cannot_be_captured_runs_as_it_is(make, monkeypatch, fake_cuda):
-    fake_cuda[1].append(RuntimeError("no graph today"))
+    try:
+        try:
+            raise ValueError("no graph today")
+        finally:
+            raise RuntimeError("something went wrong before")
+    except RuntimeError as error:
+        fake_cuda[1].append(error)
     eager = make(ChainEnv()).learn(100)
-    captured = as_on_a_gpu(make(ChainEnv()), monkeypatch).learn(100)
-    assert captured._captured.failure == "no graph today" and len(fake_cuda[0]) == 1  # tried once
+    with pytest.warns(UserWarning, match="cannot be captured and run as they are: ValueError: no graph today"):
+        captured = as_on_a_gpu(make(ChainEnv()), monkeypatch).learn(100)
+    assert len(fake_cuda[0]) == 1  # tried once
+    assert_same(eager, captured)
+
+
+def test_frames_that_do_not_fit_on_the_gpu_stay_on_the_host(make, monkeypatch, fake_cuda):
+    eager = make(ChainEnv()).learn(100)
+    captured = as_on_a_gpu(make(ChainEnv()), monkeypatch)
+
+    def too_many():
+        raise th.cuda.OutOfMemoryError("7 GB")
+
+    monkeypatch.setattr(captured.replay_buffer, "update_device_frames", too_many)
+    with pytest.warns(UserWarning, match="OutOfMemoryError: 7 GB"):
+        captured.learn(100)
     assert_same(eager, captured)
 
 
@@ -129,12 +196,23 @@ def test_no_gpu_is_said_once(make, fast):
     assert len([w for w in caught if "captured" in str(w.message)]) == 1 and model._n_updates > 0
 
 
+class BufferOfOnesOwn(SequenceReplayBuffer):
+    def sample(self, batch_size, env=None):
+        return super().sample(batch_size, env)
+
+
 @pytest.mark.parametrize(
     "change, reason",
     [
         ({}, None),
         ({"env": VecNormalize}, "VecNormalize"),
-        ({"policy_kwargs": {"optimizer_class": th.optim.Adagrad}}, "Adagrad"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.RMSprop}}, "the optimiser keeps a part of its state on the host"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"foreach": True}}}, "the optimiser keeps"),
+        (
+            {"policy_kwargs": {"group": "SO(3)^2 x SE(2)", "parameterization": "exp"}},
+            "elements of .* need a matrix exponential",
+        ),
+        ({"replay_buffer_class": BufferOfOnesOwn}, "BufferOfOnesOwn has a sample of its own"),
     ],
 )
 def test_reasons_why_not(make, change, reason, monkeypatch):
@@ -197,13 +275,19 @@ def test_samples_on_the_device_are_the_samples(make, policy):
 def test_overlap_starts_a_round_when_the_next_action_is_chosen(make, monkeypatch):
     """The action of a step is chosen by the networks before the round of the step before; nothing is lost in the end."""
     model = make(ChainEnv(), fast="overlap", learning_starts=40)
-    seen = []
+    seen, modes = [], set()
     store = model._store_transition
-    monkeypatch.setattr(model, "_store_transition", lambda *args: seen.append(model._n_updates) or store(*args))
+
+    def watched(*args):
+        seen.append(model._n_updates)
+        modes.add(model.policy.training)
+        store(*args)
+
+    monkeypatch.setattr(model, "_store_transition", watched)
     with pytest.warns(UserWarning, match="not captured"):
         model.learn(60)
     steps = {n: (0 if n <= 41 else 2 * (n - 41)) for n in range(1, 61)}  # rounds before the transition of step n is stored
-    assert seen == list(steps.values())
+    assert seen == list(steps.values()) and modes == {False}  # eval mode, as SB3's loop and callbacks know it
     assert model._n_updates == 2 * 20 and model._waiting_round is None
 
 
@@ -226,17 +310,34 @@ def test_overlap_writes_priorities_one_update_late_and_is_deterministic(make, mo
 
 @pytest.mark.filterwarnings("ignore:fast=")
 def test_overlap_survives_saving(make, tmp_path):
-    model = make(ChainEnv(), fast="overlap").learn(60)
-    model.save(tmp_path / "model")
-    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
-    assert (loaded.fast, loaded._waiting_round) == ("overlap", None)
-    loaded.learn(20)
+    """Also in the middle, by a callback, with a round that waits."""
+    model = make(ChainEnv(), fast="overlap")
+    callback = CheckpointCallback(60, str(tmp_path), save_replay_buffer=True)
+    model.learn(61, callback)
+    loaded = make.algorithm.load(tmp_path / "rl_model_60_steps", env=ChainEnv())
+    loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_60_steps")
+    assert loaded.fast == "overlap" and loaded._waiting_round is None  # of step 59: it was started when step 60 began
+    n_updates = loaded._n_updates
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded._n_updates == n_updates + 2 * 20
+
+
+@pytest.mark.filterwarnings("ignore:fast=")
+def test_late_priorities_revive_nothing(make):
+    """A ring that is full: what is overwritten while its priority is on the way cannot be drawn."""
+    model = make(ChainEnv(), fast="overlap", buffer_size=50, batch_size=16).learn(200)
+    tree, buffer = model.replay_buffer._tree, model.replay_buffer
+    newest = (buffer.pos - 1 - np.arange(buffer.window - 1)) % buffer.buffer_size
+    assert (tree.get(newest) == 0).all() and (tree.get(np.arange(50)) > 0).sum() == 50 - len(newest)
 
 
 @pytest.mark.parametrize("policy", ["CnnPolicy", "MlpPolicy"])
 def test_bfloat16_losses_agree(make, policy):
     """Eight bits of mantissa: losses agree to a few per cent, the group's parameters are computed in full."""
-    model = make(ENVS[policy](), policy, shift_pixels=0, intensity_scale=0.0).learn(80)
+    kwargs = {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}
+    model = make(ENVS[policy](), policy, shift_pixels=0, intensity_scale=0.0, policy_kwargs=kwargs).learn(80)
+    dtypes = set()
+    model.policy.online.features_extractor.to_algebra.register_forward_hook(lambda m, i, out: dtypes.add(out.dtype))
     model.policy.set_training_mode(True)
     samples, losses = model.replay_buffer.sample(64), {}
     for model.bf16 in (False, True):
@@ -245,6 +346,7 @@ def test_bfloat16_losses_agree(make, policy):
         losses[model.bf16] = [part.mean() for part in (td.loss, *auxiliary)]
         assert all(loss.dtype == th.float32 for loss in losses[model.bf16])
     th.testing.assert_close(losses[True], losses[False], rtol=0.05, atol=1e-3)
+    assert dtypes == {th.float32}
     if policy == "CnnPolicy":
         assert losses[True] != losses[False]  # the switch is wired
 

@@ -369,7 +369,7 @@ def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
     monitor.start_round(1)
     before = optimizer.state[layer.weight]["exp_avg"].clone()
     optimizer.state.clear()
-    monitor.add(["loss"], th.tensor([float("nan")]))
+    monitor.add({"loss": th.tensor(float("nan"))})
     with pytest.raises(FloatingPointError):
         monitor.collect()
     assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2

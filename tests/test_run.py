@@ -474,7 +474,7 @@ def test_logged_figures_are_means_over_the_updates_since_the_last_dump(make):
     for values in ((1.0, 3.0), (5.0, 7.0)):
         model._monitor.start_round(0)
         for value in values:
-            model._monitor.add(["loss", "grad_norm"], th.tensor([value, value + 1]))
+            model._monitor.add({"loss": th.tensor(value), "grad_norm": th.tensor(value + 1)})
         model._collect_metrics()
     logged = model.logger.name_to_value
     assert (logged["train/loss"], logged["train/grad_norm"]) == (4.0, 5.0)

@@ -353,12 +353,14 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
         """
         :param indices: of the samples, (B,)
-        :param priorities: their new priorities p ≥ 0, (B,); entries that are not finite are passed over
+        :param priorities: their new priorities p ≥ 0, (B,); entries that are not finite are passed over, and samples that
+            cannot be drawn any more
         """
         scaled = (priorities.cpu().numpy().astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
-        finite = np.isfinite(scaled)
-        if not finite.all():
-            indices, scaled = indices[finite], scaled[finite]
+        # A start that was overwritten, or has no whole window any more, stays at 0.
+        takes_part = np.isfinite(scaled) & (self._tree.get(indices) > 0)
+        if not takes_part.all():
+            indices, scaled = indices[takes_part], scaled[takes_part]
         if len(scaled) > 0:
             self._tree.set(indices, scaled)
             self._max_priority = max(self._max_priority, float(scaled.max()))

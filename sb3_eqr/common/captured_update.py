@@ -55,17 +55,18 @@ class _Capture:
 class CapturedUpdate:
     """
     Runs a function of tensors on a GPU: its first calls as they are, while libraries and optimiser allocate what they keep,
-    then captured. A call that cannot be captured says why, and from then on all run as they are.
+    then captured. Where a call cannot be captured, ``failure`` says why, and from then on all run as they are.
 
     The function reads its inputs and a model and changes the model in place; it never waits for the GPU, makes no shape depend
-    on a number, and draws from torch's generator of the device. Learning rates are read at each call.
+    on a number, and draws from torch's generator of the device. The learning rate is read at each call.
 
     :param function: of the inputs, on the device; returns outputs on the device
-    :param optimizer: what the function steps
+    :param optimizer: what the function steps: fused, so that all its state is on the device
     :param device: a CUDA device
     """
 
     WARM_UP = 3
+    KEPT = 4  # graphs; each has memory of its own
 
     def __init__(self, function: Callable[[Tensors], Tensors], optimizer: th.optim.Optimizer, device: th.device):
         self._function = function
@@ -74,11 +75,22 @@ class CapturedUpdate:
         self._captures: dict[Hashable, _Capture] = {}
         self._learning_rate = th.zeros((), device=device)
         self._loaded_rate: float | None = None
+        self._stream: th.cuda.Stream | None = None
         self.failure: str | None = None
 
     def forget(self) -> None:
         """The optimiser's state or the model's tensors are others now: capture again."""
         self._captures.clear()
+
+    def give_up(self, error: BaseException) -> None:
+        """
+        :param error: why no call is captured any more
+        """
+        while error.__context__ is not None:  # CUDA tells the first failure, what comes after only that there was one
+            error = error.__context__
+        self.failure = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+        self.forget()
+        warnings.warn(f"fast: updates cannot be captured and run as they are: {self.failure}")
 
     def __call__(self, key: Hashable, arrays: dict[str, np.ndarray]) -> Tensors:
         """
@@ -88,14 +100,16 @@ class CapturedUpdate:
         """
         key = (key, *((name, array.shape, array.dtype) for name, array in arrays.items()))
         if key not in self._captures:
+            while len(self._captures) >= self.KEPT:
+                del self._captures[next(iter(self._captures))]  # the oldest
             self._captures[key] = _Capture(arrays, self._device)
         capture = self._captures[key]
         capture.inputs.load(arrays)
         capture.calls += 1
-        if capture.graph is None and capture.calls > self.WARM_UP and self.failure is None:
+        if capture.graph is None and capture.calls > self.WARM_UP:
             self._capture(capture)
         if capture.graph is None:
-            return self._warm_up(capture)
+            return self._run(capture)
         rate = self._optimizer.param_groups[0]["lr"]
         if rate != self._loaded_rate:
             self._learning_rate.fill_(rate)
@@ -103,25 +117,33 @@ class CapturedUpdate:
         capture.graph.replay()
         return capture.outputs
 
-    def _warm_up(self, capture: _Capture) -> Tensors:
-        """Beside the current stream, as a capture needs it."""
-        now = th.cuda.current_stream(self._device)
-        aside = th.cuda.Stream(self._device)
+    def _run(self, capture: _Capture) -> Tensors:
+        """As it is; beside the current stream, as a capture wants it to have been."""
+        if self.failure is not None:
+            return self._function(capture.inputs.tensors)
+        now, aside = th.cuda.current_stream(self._device), self._aside()
         aside.wait_stream(now)
         with th.cuda.stream(aside):
             outputs = self._function(capture.inputs.tensors)
         now.wait_stream(aside)
         return outputs
 
+    def _aside(self) -> th.cuda.Stream:
+        if self._stream is None:
+            self._stream = th.cuda.Stream(self._device)
+        return self._stream
+
     def _capture(self, capture: _Capture) -> None:
+        """Nothing runs yet."""
         graph = th.cuda.CUDAGraph()
+        now = th.cuda.current_stream(self._device)
         try:
-            with self._capturable_optimizer(), th.cuda.graph(graph):  # nothing runs yet
-                capture.outputs = self._function(capture.inputs.tensors)
-        except RuntimeError as error:
-            th.cuda.synchronize(self._device)
-            self.failure = str(error).splitlines()[0]
-            warnings.warn(f"fast: this update cannot be captured and runs as it is: {self.failure}")
+            # A capture that fails may leave its stream current: the outer context brings this one back.
+            with th.cuda.device(self._device), th.cuda.stream(now), self._capturable_optimizer():
+                with th.cuda.graph(graph, stream=self._aside()):
+                    capture.outputs = self._function(capture.inputs.tensors)
+        except Exception as error:  # torch raises several kinds
+            self.give_up(error)
         else:
             capture.graph = graph
 

@@ -21,7 +21,8 @@ class DeviceFrames:
 
     def _upload(self) -> None:
         self.store.start_log()
-        self.frames = th.as_tensor(self.store.frames, device=self._device)  # (capacity, *frame_shape)
+        self.frames = th.zeros(0)  # an old copy makes room
+        self.frames = th.as_tensor(self.store.frames).to(self._device, copy=True)  # (capacity, *frame_shape)
 
     def update(self) -> None:
         """Send what the store has written since the last call."""

@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from torch import nn
 
 from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
 from sb3_eqr.common.layers import Whitening
 from sb3_eqr.common.networks import EqRNetwork
 from sb3_eqr.common.preprocessing import ImageAugmentation
@@ -130,7 +131,7 @@ class EqRAlgorithm(UpdateRounds):
         """
         All of an update that the device does.
 
-        :return: "figures", what the monitor shows, and new "priorities", (B,), where there is a TD loss
+        :return: what the monitor shows, scalars by name, and new "priorities", (B,), where there is a TD loss
         """
         td, auxiliary = self._compute_losses(samples)
         parts = {"td": None if td is None else td.loss, **auxiliary._asdict()}
@@ -146,12 +147,10 @@ class EqRAlgorithm(UpdateRounds):
             self.policy.update_target(self.tau)
         with th.no_grad():
             figures = {f"{name}_loss": part.mean() for name, part in parts.items() if part is not None}
-            figures.update(loss=loss, grad_norm=grad_norm)
+            figures.update(loss=loss.detach(), grad_norm=grad_norm)
             if td is not None:
                 figures["mean_q_value"] = td.q_values.mean()
-            self._figure_names = list(figures)
-            stacked = th.stack(list(figures.values()))
-        return {"figures": stacked} if td is None else {"figures": stacked, "priorities": td.priorities}
+        return figures if td is None else {**figures, "priorities": td.priorities}
 
     def _record(self, indices: np.ndarray, outputs: dict[str, th.Tensor]) -> None:
         """
@@ -162,7 +161,7 @@ class EqRAlgorithm(UpdateRounds):
         """
         self._n_updates += 1
         self._target_is_copy = self.target_update_interval is None and self.tau == 1.0
-        self._monitor.add(self._figure_names, outputs["figures"])
+        self._monitor.add({name: figure for name, figure in outputs.items() if name != "priorities"})
         if "priorities" in outputs and isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
             self._late.add(self.replay_buffer, indices, outputs["priorities"])
             if self.fast != "overlap":
@@ -203,8 +202,12 @@ class EqRAlgorithm(UpdateRounds):
     def _encode(self, network: EqRNetwork, observations: PyTorchObs) -> th.Tensor:
         if not self.bf16:
             return network.encode(observations)
+        encoder = network.features_extractor
+        trunk = encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder
         with th.autocast(self.device.type, th.bfloat16, cache_enabled=False):
-            return network.encode(observations).float()
+            features = trunk(observations).float()
+        # Angles and their products need all their digits.
+        return encoder.elements(features) if isinstance(encoder, GroupFeaturesExtractor) else features
 
     def _pieces(self, observations: PyTorchObs) -> list[PyTorchObs]:
         """
@@ -297,6 +300,10 @@ class EqRAlgorithm(UpdateRounds):
         self._target_is_copy = False  # nothing is known of them
         self._captured.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
+        for parameter, state in self.policy.optimizer.state.items():
+            for name, value in state.items():
+                if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
+                    state[name] = th.empty_like(parameter).copy_(value)  # fused kernels read both in one order
 
     def load_representation(
         self: SelfEqRAlgorithm, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False
@@ -334,7 +341,6 @@ class EqRAlgorithm(UpdateRounds):
             "_encoder_ignores_mode",
             "_target_is_copy",
             "_augment",
-            "_figure_names",
         ]
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import get_device
 
 from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.checks import check_number
@@ -71,7 +72,7 @@ class EqRArguments(SafeFiles):
         reset_interval: int | None = None,
         reset_shrink_factor: float = 0.5,
         reset_fraction: float = 0.9,
-        fast: str = "auto",
+        fast: str = "off",
         bf16: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -135,10 +136,11 @@ class EqRArguments(SafeFiles):
         :param reset_shrink_factor: α in [0, 1]: at a reset, encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF
         :param reset_fraction: fraction of the entire training period (as SB3 counts it for each call of ``learn``) after
             which there are no resets any more, so that the final agent has had time to recover
-        :param fast: how updates run. "auto": on a GPU captured as one CUDA graph, elsewhere as they are; "off": as they are;
+        :param fast: how updates run. "off": as they are; "auto": on a GPU captured as one CUDA graph, elsewhere as they are;
             "graph": captured, with a warning that says why where that cannot be; "overlap": captured, and the environments
             step while the GPU computes: an action is chosen by the networks of one round of updates before, and priorities are
-            written one update late. The first three give the same numbers to rounding
+            written one update late. The first three give the same numbers to rounding. "off" is the default until captured
+            updates have been measured on a GPU
         :param bf16: in updates, the convolutions (or what else stands in front of the group encoder's linear layer) compute in
             bfloat16, by autocast; for GPUs
         :param stats_window_size: Window size for the rollout logging
@@ -160,7 +162,8 @@ class EqRArguments(SafeFiles):
         if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
             # Epsilon of Table 5; one kernel for all parameters, on CPU and GPU, where PyTorch's default has six for each.
             given = policy_kwargs.get("optimizer_kwargs") or {}
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, "fused": not given.get("foreach"), **given}
+            fused = get_device(device).type in ("cpu", "cuda") and not (given.get("foreach") or given.get("differentiable"))
+            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, "fused": fused, **given}
         super().__init__(  # type: ignore[call-arg]
             policy,
             env,

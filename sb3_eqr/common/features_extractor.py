@@ -191,7 +191,14 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         :param observations: preprocessed by SB3, (B, ...) or a dict of these
         :return: the K elements, flattened, (B, features_dim)
         """
-        params = self.to_algebra(self.trunk(observations))  # (B, K * num_params)
+        return self.elements(self.trunk(observations))
+
+    def elements(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: of the trunk, (B, n)
+        :return: the K elements, flattened, (B, features_dim)
+        """
+        params = self.to_algebra(features)  # (B, K * num_params)
         elements = self.group.element(params.unflatten(-1, (self.n_blocks, self.group.num_params)))
         return elements.flatten(1)  # (B, K * prod(element_shape))
 

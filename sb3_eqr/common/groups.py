@@ -28,11 +28,13 @@ class Group(ABC):
     ``num_params``: how many numbers the network predicts per element.
     ``element_shape``: the shape of one element.
     ``has_inverse``: False only where the "group" is none (see :class:`NoGroup`).
+    ``needs_host``: True where an element needs a number on the host, as PyTorch's matrix exponential does on a GPU.
     """
 
     num_params: int
     element_shape: tuple[int, ...]
     has_inverse: bool = True
+    needs_host: bool = False
 
     def __init__(self, name: str, num_params: int, element_shape: tuple[int, ...]):
         self.name = name
@@ -146,6 +148,7 @@ class SO(MatrixGroup):
         count, self.rotation = ROTATIONS[parameterization]
         super().__init__(f"SO({n})", count(n), (n, n))
         self.parameterization = parameterization
+        self.needs_host = parameterization == "exp"
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return self.rotation(params, self.element_shape[-1])
@@ -166,6 +169,7 @@ class SE(MatrixGroup):
         super().__init__(f"SE({n})", count(n) + n, (n + 1, n + 1))
         self.n = n
         self.parameterization = parameterization
+        self.needs_host = parameterization == "exp"
 
     def element(self, params: th.Tensor) -> th.Tensor:
         angles, translation = params.split([self.num_params - self.n, self.n], dim=-1)
@@ -244,6 +248,8 @@ class MatrixLieGroup(MatrixGroup):
     :raises ValueError: if the shape is another, an entry is not finite, or they depend on each other
     """
 
+    needs_host = True
+
     def __init__(self, generators: th.Tensor | Sequence):
         basis = th.as_tensor(generators, dtype=th.float64)
         if basis.ndim != 3 or basis.shape[1] != basis.shape[2] or 0 in basis.shape or not basis.isfinite().all():
@@ -282,6 +288,7 @@ class ProductGroup(Group):
     def __init__(self, factors: Sequence[tuple[Group, int]]):
         self.factors = list(factors)
         self.has_inverse = all(group.has_inverse for group, _ in self.factors)
+        self.needs_host = any(group.needs_host for group, _ in self.factors)
         self._sizes = [count * prod(group.element_shape) for group, count in self.factors]
         name = " x ".join(f"{group}^{count}" if count > 1 else f"{group}" for group, count in self.factors)
         super().__init__(name, sum(group.num_params * count for group, count in self.factors), (sum(self._sizes),))

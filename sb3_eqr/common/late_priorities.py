@@ -29,10 +29,11 @@ class LatePriorities:
         """
         arrived = None
         if priorities.device.type == "cuda":
+            stream = th.cuda.current_stream(priorities.device)
             host = th.empty(priorities.shape, dtype=priorities.dtype, pin_memory=True)
             priorities = host.copy_(priorities, non_blocking=True)
             arrived = th.cuda.Event()
-            arrived.record()
+            arrived.record(stream)
         self._late.append(_Late(buffer, indices, priorities, arrived))
 
     def write_back(self, but: int = 0) -> None:

@@ -204,7 +204,8 @@ class ConvTrunk(nn.Sequential):
         Lay the weights out as :meth:`forward` computes, so that no call has to copy them. Not done from the start: the
         orthogonal initialisation of stock PPO takes no other layout than PyTorch's.
         """
-        if next(self.parameters()).shape[1] > 1:  # images of one channel have but one layout
+        first = next(iter(self.parameters()), None)
+        if first is not None and first.shape[1] > 1:  # images of one channel have but one layout
             self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: th.Tensor) -> th.Tensor:

@@ -51,8 +51,9 @@ class EqRPolicy(BasePolicy):
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate. The agent's constructor adds ``eps=1.5e-4``
-        (Table 5) and ``fused=True`` (one kernel for all parameters) for Adam and AdamW where they are not given. ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452;
-        AdamW's own default is 0.01) reaches matrices only, not biases, batch-norm parameters and the noise of noisy layers
+        (Table 5) and ``fused=True`` (one kernel for all parameters) for Adam and AdamW where they are not given.
+        ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452; AdamW's own default is 0.01) reaches matrices only,
+        not biases, batch-norm parameters and the noise of noisy layers
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
         "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks

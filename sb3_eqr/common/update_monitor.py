@@ -67,14 +67,13 @@ class UpdateMonitor:
             th._foreach_copy_([*kept[0], *kept[1].values()], [*model, *(state[key] for key in kept[1])])
         self._start = Backup(n_updates, *kept)
 
-    def add(self, names: list[str], figures: th.Tensor) -> None:
+    def add(self, figures: dict[str, th.Tensor]) -> None:
         """
-        :param names: of the figures, the same for all updates of a round
-        :param figures: of one update, (len(names),)
+        :param figures: of one update, scalars; the names are the same for all updates of a round
         """
         self._has_updates = True
-        self._names = names
-        self._pending.append(figures)
+        self._names = list(figures)
+        self._pending.append(th.stack(list(figures.values())))
 
     def collect(self) -> dict[str, float]:
         """

@@ -1,14 +1,17 @@
 """When a round of updates runs, and whether as a captured graph."""
 
+import io
+import pathlib
 import warnings
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.captured_update import CapturedUpdate
 from sb3_eqr.common.eqr_setup import EqRSetup
 from sb3_eqr.common.late_priorities import LatePriorities
@@ -28,6 +31,8 @@ class UpdateRounds(EqRSetup):
         self._may_wait = False
         self._warned_of_eager = False
 
+    _trained: list[th.nn.Parameter]
+
     @property
     @abstractmethod
     def _target_is_online(self) -> bool:
@@ -36,6 +41,10 @@ class UpdateRounds(EqRSetup):
     @abstractmethod
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         """A round of updates."""
+
+    @abstractmethod
+    def _update(self, samples: SequenceReplayBufferSamples) -> None:
+        """One gradient step, the target, the priorities."""
 
     @abstractmethod
     def _update_networks(self, samples: SequenceReplayBufferSamples) -> dict[str, th.Tensor]:
@@ -59,7 +68,9 @@ class UpdateRounds(EqRSetup):
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         """As SB3's, with the same parameters; a round of updates that has waited for the action is started now."""
         actions = super()._sample_action(*args, **kwargs)
-        self._start_waiting_round()
+        if self._waiting_round is not None:
+            self._start_waiting_round()
+            self.policy.set_training_mode(False)  # as callbacks know it
         return actions
 
     def _start_waiting_round(self) -> None:
@@ -82,35 +93,63 @@ class UpdateRounds(EqRSetup):
 
     def _captures(self) -> bool:
         """Whether updates are captured; if that was asked for and cannot be, say why, once."""
-        reason = None
-        if self.device.type != "cuda":
-            reason = f"CUDA graphs need a GPU, and device is {self.device.type!r}"
-        elif self._vec_normalize_env is not None:
-            reason = "VecNormalize changes observations on the host"
-        elif not all("capturable" in group for group in self.policy.optimizer.param_groups):
-            reason = f"{type(self.policy.optimizer).__name__} cannot be, Adam and AdamW can"
-        if reason is not None and self.fast in ("graph", "overlap") and not self._warned_of_eager:
+        if self.fast == "off":
+            return False
+        reason = self._captured.failure or self._why_not_captured()
+        if reason is not None and self.fast != "auto" and not self._warned_of_eager:
             self._warned_of_eager = True
-            warnings.warn(f"fast={self.fast!r}: updates are not captured: {reason}.")
-        return reason is None and self.fast != "off"
+            if self._captured.failure is None:  # it has been told otherwise
+                warnings.warn(f"fast={self.fast!r}: updates are not captured: {reason}.")
+        return reason is None
+
+    def _why_not_captured(self) -> str | None:
+        buffer = type(self.replay_buffer)
+        if self.device.type != "cuda":
+            return f"CUDA graphs need a GPU, and device is {self.device.type!r}"
+        if self._vec_normalize_env is not None:
+            return "VecNormalize changes observations on the host"
+        if not all(group.get("fused") for group in self.policy.optimizer.param_groups):
+            return 'the optimiser keeps a part of its state on the host (optimizer_kwargs={"fused": True} would not)'
+        if self.policy.latent_model.group.needs_host:
+            return f"elements of {self.policy.latent_model.group} need a matrix exponential"
+        if any(getattr(buffer, name) is not getattr(SequenceReplayBuffer, name) for name in ("sample", "_samples")):
+            return f"{buffer.__name__} has a sample of its own"
+        return None
 
     def _run_captured(self, arrays: dict[str, np.ndarray]) -> None:
         """
         :param arrays: of the replay buffer's ``draw``
         """
         assert self.replay_buffer is not None
-        constants = (
-            *self.replay_buffer.update_device_frames(),
+        try:
+            places = self.replay_buffer.update_device_frames()
+        except th.cuda.OutOfMemoryError as error:
+            self._captured.give_up(error)
+            self._update(self.replay_buffer._samples(arrays, None))
+            return
+        outputs = self._captured((places, self._constants()), arrays)
+        if "priorities" in outputs:  # the next update writes to the same place
+            outputs = {**outputs, "priorities": outputs["priorities"].clone()}
+        self._record(arrays["indices"], outputs)
+
+    def _constants(self) -> tuple[Hashable, ...]:
+        """Whatever an update depends on that a graph holds fast: numbers, and where tensors are."""
+        moments = self.policy.optimizer.state
+        return (
             *(getattr(self, f"{name}_coef") for name in ("td", "aet", "get", "reward")),
-            *(self.tau, self.max_grad_norm, self.double_q, self.target_update_interval is None, self._target_is_online),
+            *(self.tau, self.max_grad_norm, self.double_q, self.bf16, self.shift_pixels, self.intensity_scale),
+            *(self.target_update_interval is None, self._target_is_online),
+            *((p.requires_grad, p.data_ptr(), *(t.data_ptr() for t in moments[p].values())) for p in self._trained),
         )
-        figures = self._captured(constants, arrays)
-        # The next update writes to the same place.
-        self._record(arrays["indices"], {name: figure.clone() for name, figure in figures.items()})
 
     def _update_captured(self, tensors: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
         assert self.replay_buffer is not None
         return self._update_networks(self.replay_buffer.samples_on_device(tensors))
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """As SB3's ``save_replay_buffer``, with the same parameters."""
+        self._late.write_back()
+        super().save_replay_buffer(path)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_captured", "_late", "_may_wait", "_warned_of_eager"]
