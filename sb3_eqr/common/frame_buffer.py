@@ -70,17 +70,17 @@ class FrameReplayBuffer(ReplayBuffer):
         fields.update({field: self._unkeyed(value) for field, value in fields.items() if "observations" in field})
         return SequenceReplayBufferSamples(**fields)
 
-    def update_device_frames(self) -> tuple[int, ...]:
+    def update_device_frames(self) -> tuple[tuple[int, int], ...]:
         """
         Bring the frames on the device up to date; they are 7 kB per transition of Atari.
 
-        :return: where they are in memory: it changes when a store grows
+        :return: where they are in memory, and how many: both change when a store grows
         """
         for key, store in self._stores.items():
             if key not in self._device_frames or self._device_frames[key].store is not store:
                 self._device_frames[key] = DeviceFrames(store, self.device)
             self._device_frames[key].update()
-        return tuple(frames.frames.data_ptr() for frames in self._device_frames.values())
+        return tuple((held.frames.data_ptr(), len(held.frames)) for held in self._device_frames.values())
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_device_frames": {}}  # made again when they are needed
