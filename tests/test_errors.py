@@ -124,6 +124,7 @@ def test_a_bad_first_observation_is_refused_before_the_first_step(make):
 
 
 @pytest.mark.parametrize("trained", [0, 5])
+@pytest.mark.usefixtures("backup_each_round")
 def test_losses_that_are_not_finite_leave_the_last_good_model(make, trained, tmp_path):
     """The first loss of a round tells on the round before: the model goes back to where that one began."""
     model = make(ChainEnv()).learn(40 + trained)
@@ -147,6 +148,7 @@ def test_losses_that_are_not_finite_leave_the_last_good_model(make, trained, tmp
     assert make.algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
 
 
+@pytest.mark.usefixtures("backup_each_round")
 def test_the_very_first_update_may_be_the_bad_one(make):
     model = make(ChainEnv(), learning_starts=1000).learn(60)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
@@ -164,6 +166,7 @@ def test_the_very_first_update_may_be_the_bad_one(make):
 @EITHER
 @pytest.mark.parametrize("gradient_steps", [1, 2, 3])
 @pytest.mark.parametrize("good_rounds", [0, 1, 4])
+@pytest.mark.usefixtures("backup_each_round")
 def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, gradient_steps, good_rounds):
     """The losses of an update do not show what its own step has done: the next round's do."""
     model = make(ChainEnv(), gradient_steps=gradient_steps, learning_starts=40)

@@ -282,6 +282,7 @@ def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
     assert model._n_updates > 4
 
 
+@pytest.mark.usefixtures("backup_each_round")
 def test_rounds_without_updates_keep_the_last_sound_model(make):
     """The last update before the reset has spoilt the model, which only the first update after it can tell."""
     model = wait_for_a_longer_window(make)
@@ -331,6 +332,7 @@ def test_a_policy_of_ones_own_is_drawn_with_its_arguments():
     assert all((parameter == 0).all() for parameter in model.q_net.head.parameters())
 
 
+@pytest.mark.usefixtures("backup_each_round")
 def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch):
     """The second update of the round in which the reset was made: back to its start, before the reset."""
     model = make(ChainEnv(), reset_interval=40).learn(60)
@@ -373,6 +375,26 @@ def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
     with pytest.raises(FloatingPointError):
         monitor.collect()
     assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2
+
+
+def test_backups_are_as_old_as_they_may_be():
+    """Rounds of 20 updates, a backup every 50 or more: at 0, 60, 120."""
+    layer = th.nn.Linear(1, 1)
+    monitor = UpdateMonitor(layer, th.optim.SGD(layer.parameters()))
+
+    def round_of_updates(n_updates, loss):
+        monitor.start_round(n_updates)
+        with th.no_grad():
+            layer.weight.fill_(n_updates + 20)
+        for value in (1.0,) * 19 + (loss,):
+            monitor.add({"loss": th.tensor(value)})
+        return monitor.collect()
+
+    for n_updates in (0, 20, 40, 60, 80, 100, 120):
+        assert round_of_updates(n_updates, 1.0) == {"loss": 1.0}
+    with pytest.raises(FloatingPointError, match=r"update 160: .*put back to update 120 "):
+        round_of_updates(140, float("nan"))
+    assert layer.weight.item() == 120
 
 
 # ---------------------------------------------------------------------------------------------- optimiser, trunk

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from rl_zoo3.utils import get_wrapper_class
@@ -181,12 +182,16 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     :param n_episodes: number of episodes
     :param seed: of the run
     """
-    before = get_rng_state(model.action_space)
-    play = play_atari if fits_atari_batch(protocol, model) else play_environments
+    before, n_threads = get_rng_state(model.action_space), th.get_num_threads()
+    play = play_environments
+    if fits_atari_batch(protocol, model):
+        play = play_atari
+        th.set_num_threads(max(n_threads // 2, 1))  # the emulator has threads of its own
     try:
         scores, lengths = play(model, protocol, n_episodes, FIRST_SEED + SEEDS * seed)
     finally:
         set_rng_state(before, model.action_space)
+        th.set_num_threads(n_threads)
     return [float(score) for score in scores], [int(length) for length in lengths]
 
 

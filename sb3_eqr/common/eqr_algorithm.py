@@ -299,6 +299,7 @@ class EqRAlgorithm(UpdateRounds):
         """As SB3's ``set_parameters``, with the same parameters."""
         self._target_is_copy = False  # nothing is known of them
         self._captured.forget()
+        self._monitor.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
         for parameter, state in self.policy.optimizer.state.items():
             for name, value in state.items():

@@ -34,27 +34,39 @@ class UpdateMonitor:
 
     Figures stay on the device until the next round of updates, when they are long computed: no update waits for them.
     The losses of an update are computed before its step, so the first update of a round is what tells whether the
-    round before left a sound model. That is why the starts of two rounds are kept.
+    round before left a sound model. That is why two backups are kept. They are made at the start of a round, but not of every
+    one: a backup takes as long as some hundred small operations.
 
     :param model: whose parameters and buffers are kept
     :param optimizer: whose state is kept
     """
+
+    INTERVAL = 50  # updates between two backups, at least
 
     def __init__(self, model: nn.Module, optimizer: th.optim.Optimizer):
         self._model = model
         self._optimizer = optimizer
         self._names: list[str] = []
         self._pending: list[th.Tensor] = []  # (len(names),) each
-        self._has_updates = False
-        self._start: Backup | None = None  # of the last round
-        self._sound_start: Backup | None = None  # of the round before: its figures are known to be finite
+        self._round_start = 0  # updates done before it
+        self._has_updates = False  # since the last backup
+        self._start: Backup | None = None  # the last one
+        self._sound_start: Backup | None = None  # the one before: the figures after it are known to be finite
+
+    def forget(self) -> None:
+        """The model is another one now: there is no way back to before."""
+        self._pending.clear()
+        self._start = self._sound_start = None
 
     def start_round(self, n_updates: int) -> None:
         """
-        Remember model and optimiser as they are now.
+        Remember model and optimiser as they are now, if the last backup is old enough.
 
         :param n_updates: updates done so far
         """
+        self._round_start = n_updates
+        if self._start is not None and n_updates < self._start.n_updates + self.INTERVAL:
+            return
         model, state = self._model_tensors(), self._optimizer_tensors()
         old = self._start
         if self._has_updates:  # a round without updates says nothing about the one before
@@ -91,8 +103,9 @@ class UpdateMonitor:
         if finite.all():
             return dict(zip(self._names, figures.mean(axis=0, dtype=np.float64).tolist(), strict=True))
         first = int(np.argmin(finite.all(axis=1)))
-        bad_update = self._start.n_updates + first + 1
-        sound = self._start if first > 0 or self._sound_start is None else self._sound_start
+        bad_update = self._round_start + first + 1
+        is_first = bad_update == self._start.n_updates + 1  # after the last backup, which may be of a spoilt model
+        sound = self._sound_start if is_first and self._sound_start is not None else self._start
         self._put_back(sound)
         wrong = [f"{n} = {v}" for n, v, ok in zip(self._names, figures[first], finite[first], strict=True) if not ok]
         raise BadUpdateError(

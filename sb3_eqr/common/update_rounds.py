@@ -24,14 +24,14 @@ class UpdateRounds(EqRSetup):
     :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` adds the updates.
     """
 
+    _trained: list[th.nn.Parameter]
+
     def _setup_model(self) -> None:
         super()._setup_model()
         self._captured = CapturedUpdate(self._update_captured, self.policy.optimizer, self.device)
         self._late = LatePriorities()
         self._may_wait = False
         self._warned_of_eager = False
-
-    _trained: list[th.nn.Parameter]
 
     @property
     @abstractmethod
@@ -139,7 +139,7 @@ class UpdateRounds(EqRSetup):
             *(getattr(self, f"{name}_coef") for name in ("td", "aet", "get", "reward")),
             *(self.tau, self.max_grad_norm, self.double_q, self.bf16, self.shift_pixels, self.intensity_scale),
             *(self.target_update_interval is None, self._target_is_online),
-            *((p.requires_grad, p.data_ptr(), *(t.data_ptr() for t in moments[p].values())) for p in self._trained),
+            *((p.requires_grad, p.data_ptr(), *(t.data_ptr() for t in moments.get(p, {}).values())) for p in self._trained),
         )
 
     def _update_captured(self, tensors: dict[str, th.Tensor]) -> dict[str, th.Tensor]:

@@ -1,5 +1,6 @@
 """Whole Atari games side by side, for evaluation: ALE plays them in its own threads."""
 
+import os
 from importlib.metadata import PackageNotFoundError, version
 
 import gymnasium as gym
@@ -44,6 +45,7 @@ class AtariBatch:
         self._env = AtariVectorEnv(
             gym.spec(env_id).kwargs["game"],
             n_envs,
+            num_threads=max((os.cpu_count() or 2) - 1, 1),  # one core is the agent's
             max_num_frames_per_episode=NO_LIMIT,  # ALE would count no-ops; steps are counted here
             autoreset_mode=AutoresetMode.SAME_STEP,
             img_height=height,
