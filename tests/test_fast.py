@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_eqr.common.buffers import SequenceReplayBuffer
 from sb3_eqr.common.captured_update import CapturedUpdate, StaticInputs
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
+from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
 
 ENVS = {
@@ -97,6 +98,7 @@ def test_captured_updates_are_the_same_updates(make, policy, monkeypatch, fake_c
     assert {k: v for k, v in logged[0].items() if "loss" in k} == {k: v for k, v in logged[1].items() if "loss" in k}
 
 
+@EITHER
 def test_what_changes_a_graph_is_captured_again(make, monkeypatch, fake_cuda):
     """n moves (another number of frames is not looked at), the head is reset, a weight is changed by a callback."""
     settings = {"initial_n_steps": 6, "n_steps": 3, "annealing_steps": 30, "reset_interval": 40, "tau": 0.9}
@@ -104,11 +106,11 @@ def test_what_changes_a_graph_is_captured_again(make, monkeypatch, fake_cuda):
     for captures in (False, True):
         model = make(ChainEnv(), **settings)
         model = as_on_a_gpu(model, monkeypatch) if captures else model
-        model.learn(120)
+        model.learn(90)
         graphs.append(len(fake_cuda[0]))
         model.aet_coef = 0.25
         model.lr_schedule = lambda progress: 3e-3  # read at each replay, no reason for another graph
-        models.append(model.learn(60, reset_num_timesteps=False))
+        models.append(model.learn(40, reset_num_timesteps=False))
     eager, captured = models
     assert eager._resets == captured._resets != []
     assert_same(eager, captured)
@@ -116,6 +118,7 @@ def test_what_changes_a_graph_is_captured_again(make, monkeypatch, fake_cuda):
     assert all(isinstance(g["lr"], float) and not g["capturable"] for g in captured.policy.optimizer.param_groups)
 
 
+@EITHER
 @pytest.mark.parametrize(
     "change",
     [
@@ -144,6 +147,7 @@ def test_what_a_graph_would_hold_fast_is_in_its_key(make, monkeypatch, fake_cuda
     assert key() != before
 
 
+@EITHER
 def test_few_graphs_are_kept(make, monkeypatch, fake_cuda):
     model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
     for coef in np.linspace(0.1, 1, 9):  # as a callback may anneal it
@@ -152,6 +156,7 @@ def test_few_graphs_are_kept(make, monkeypatch, fake_cuda):
     assert len(model._captured._captures) == CapturedUpdate.KEPT
 
 
+@EITHER
 def test_losses_that_come_and_go_keep_their_names(make, monkeypatch, fake_cuda):
     model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
     for get_coef, has_get in ((0.0, False), (1.0, True), (0.0, False)):
@@ -160,6 +165,7 @@ def test_losses_that_come_and_go_keep_their_names(make, monkeypatch, fake_cuda):
         assert ("get_loss" in model._monitor.collect()) == has_get
 
 
+@EITHER
 def test_what_cannot_be_captured_runs_as_it_is(make, monkeypatch, fake_cuda):
     try:
         try:
@@ -175,6 +181,7 @@ def test_what_cannot_be_captured_runs_as_it_is(make, monkeypatch, fake_cuda):
     assert_same(eager, captured)
 
 
+@EITHER
 def test_frames_that_do_not_fit_on_the_gpu_stay_on_the_host(make, monkeypatch, fake_cuda):
     eager = make(ChainEnv()).learn(100)
     captured = as_on_a_gpu(make(ChainEnv()), monkeypatch)
@@ -188,6 +195,7 @@ def test_frames_that_do_not_fit_on_the_gpu_stay_on_the_host(make, monkeypatch, f
     assert_same(eager, captured)
 
 
+@EITHER
 @pytest.mark.parametrize("fast", ["graph", "overlap"])
 def test_no_gpu_is_said_once(make, fast):
     model = make(ChainEnv(), fast=fast)
@@ -201,6 +209,7 @@ class BufferOfOnesOwn(SequenceReplayBuffer):
         return super().sample(batch_size, env)
 
 
+@EITHER
 @pytest.mark.parametrize(
     "change, reason",
     [
@@ -227,6 +236,7 @@ def test_reasons_why_not(make, change, reason, monkeypatch):
         assert not model._captures()
 
 
+@EITHER
 def test_fast_is_checked(make):
     with pytest.raises(ValueError, match=r"fast: expected one of \['auto', 'off', 'graph', 'overlap'\], found 'very'"):
         make(ChainEnv(), fast="very")
@@ -255,6 +265,7 @@ def test_an_update_needs_no_number_from_the_device(make, policy, settings):
         total.item()
 
 
+@EITHER
 @pytest.mark.parametrize("policy", ENVS)
 def test_samples_on_the_device_are_the_samples(make, policy):
     model = make(ENVS[policy](), policy, buffer_size=60, prioritized_replay=False, learning_starts=1_000)
@@ -272,6 +283,7 @@ def test_samples_on_the_device_are_the_samples(make, policy):
             assert all(x.dtype == y.dtype and th.equal(x, y) for x, y in parts), name
 
 
+@EITHER
 def test_overlap_starts_a_round_when_the_next_action_is_chosen(make, monkeypatch):
     """The action of a step is chosen by the networks before the round of the step before; nothing is lost in the end."""
     model = make(ChainEnv(), fast="overlap", learning_starts=40)
@@ -291,6 +303,7 @@ def test_overlap_starts_a_round_when_the_next_action_is_chosen(make, monkeypatch
     assert model._n_updates == 2 * 20 and model._waiting_round is None
 
 
+@EITHER
 @pytest.mark.filterwarnings("ignore:fast=")
 def test_overlap_writes_priorities_one_update_late_and_is_deterministic(make, monkeypatch):
     model = make(ChainEnv(), fast="overlap", gradient_steps=3)
@@ -308,6 +321,7 @@ def test_overlap_writes_priorities_one_update_late_and_is_deterministic(make, mo
     assert not th.equal(model._trained[0], other._trained[0])
 
 
+@EITHER
 @pytest.mark.filterwarnings("ignore:fast=")
 def test_overlap_survives_saving(make, tmp_path):
     """Also in the middle, by a callback, with a round that waits."""
@@ -322,6 +336,7 @@ def test_overlap_survives_saving(make, tmp_path):
     assert loaded._n_updates == n_updates + 2 * 20
 
 
+@EITHER
 @pytest.mark.filterwarnings("ignore:fast=")
 def test_late_priorities_revive_nothing(make):
     """A ring that is full: what is overwritten while its priority is on the way cannot be drawn."""
@@ -331,6 +346,7 @@ def test_late_priorities_revive_nothing(make):
     assert (tree.get(newest) == 0).all() and (tree.get(np.arange(50)) > 0).sum() == 50 - len(newest)
 
 
+@EITHER
 @pytest.mark.parametrize("policy", ["CnnPolicy", "MlpPolicy"])
 def test_bfloat16_losses_agree(make, policy):
     """Eight bits of mantissa: losses agree to a few per cent, the group's parameters are computed in full."""
