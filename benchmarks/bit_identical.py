@@ -46,11 +46,18 @@ OFF = {"aet_coef": 0.0, "get_coef": 0.0, "reward_coef": 0.0}
 SCALES = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
 
 
+def make_images() -> FakeImageEnv:
+    """Random images, the same ones each time: they are drawn by the observation space, which ``reset(seed)`` does not seed."""
+    env = FakeImageEnv(4, 40, 40, n_channels=1, discrete=True)
+    env.observation_space.seed(0)
+    return env
+
+
 def make_env(kind: str, n_envs: int) -> VecEnv:
     """A few environments of one kind, made alike each time."""
     np.random.seed(0)
     if kind == "images":
-        return VecFrameStack(make_vec_env(lambda: FakeImageEnv(4, 40, 40, n_channels=1, discrete=True), n_envs), 4)
+        return VecFrameStack(make_vec_env(make_images, n_envs), 4)
     if kind == "dicts":
         return make_vec_env(lambda: SimpleMultiObsEnv(channel_last=True), n_envs)
     env = make_vec_env(lambda: gym.make("CartPole-v1"), n_envs)
