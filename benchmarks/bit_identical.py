@@ -42,7 +42,7 @@ COMMON: dict[str, Any] = {
     "seed": 7,
 }
 NETWORK = {"n_blocks": 3, "net_arch": [32], "latent_hidden_dim": 24}
-OFF = {"aet_coef": 0.0, "get_coef": 0.0, "reward_coef": 0.0}
+OFF = {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
 SCALES = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
 
 
@@ -83,21 +83,22 @@ CONFIGURATIONS: dict[str, Configuration] = {
     "SE(3) by exp": ("qrdqn", "vectors", 1, {}, {"group": "SE(3)", "parameterization": "exp"}),
     "product": ("rainbow", "vectors", 1, {}, {"group": "SE(2)^2 x SO(3)^2", "n_blocks": None}),
     "generators": ("qrdqn", "vectors", 1, {}, {"group": SCALES}),
-    "free vectors": ("rainbow", "images", 1, {"get_coef": 0.0}, {"group": "none", "n_blocks": None}),
-    "no encoder": ("qrdqn", "images", 1, {"get_coef": 0.0}, {"group": None, "n_blocks": None}),
+    "free vectors": ("rainbow", "images", 1, {"symmetry_coef": 0.0}, {"group": "none", "n_blocks": None}),
+    "no encoder": ("qrdqn", "images", 1, {"symmetry_coef": 0.0}, {"group": None, "n_blocks": None}),
     "no losses": ("rainbow", "vectors", 1, OFF, {}),
     "depth 0, no encoder": ("qrdqn", "images", 1, {"prediction_depth": 0}, {"group": None, "n_blocks": None}),
-    "AET alone": ("qrdqn", "vectors", 1, {"get_coef": 0.0, "reward_coef": 0.0}, {}),
+    "AET alone": ("qrdqn", "vectors", 1, {"symmetry_coef": 0.0, "reward_coef": 0.0}, {}),
     "GET alone": ("rainbow", "vectors", 1, {"aet_coef": 0.0, "reward_coef": 0.0}, {}),
-    "reward alone": ("qrdqn", "images", 1, {"aet_coef": 0.0, "get_coef": 0.0}, {}),
-    "signs of rewards": ("rainbow", "vectors", 1, {"reward_loss": "categorical", "aet_coef": 0.3}, {}),
+    "reward alone": ("qrdqn", "images", 1, {"aet_coef": 0.0, "symmetry_coef": 0.0}, {}),
+    "signs of rewards": ("rainbow", "vectors", 1, {"aet_coef": 0.3}, {"reward_loss": "categorical"}),
     "projections of its own": ("qrdqn", "images", 1, {}, {"projection": "own"}),
     "representation alone": (
         "qrdqn",
         "images",
         1,
-        {"td_coef": 0.0, "reward_coef": 0.0, "aet_loss": "contrastive", "prioritized_replay": False},
+        {"td_coef": 0.0, "reward_coef": 0.0, "prioritized_replay": False},
         {
+            "aet_loss": "contrastive",
             "whiten": True,
             "parameterization": "gram-schmidt",
             "state_dependent_actions": False,
@@ -107,7 +108,7 @@ CONFIGURATIONS: dict[str, Configuration] = {
             "group": "SO(2)",
         },
     ),
-    "whitened, contrastive": ("rainbow", "vectors", 1, {"aet_loss": "contrastive"}, {"whiten": True}),
+    "whitened, contrastive": ("rainbow", "vectors", 1, {}, {"aet_loss": "contrastive", "whiten": True}),
     "plain head": (
         "rainbow",
         "vectors",
@@ -122,15 +123,15 @@ CONFIGURATIONS: dict[str, Configuration] = {
         1,
         {
             "tau": 0.05,
-            "reset_interval": 70,
-            "reset_shrink_factor": 0.4,
-            "reset_fraction": 0.8,
-            "initial_n_steps": 6,
-            "initial_gamma": 0.9,
-            "annealing_steps": 50,
-            "priority_beta": 0.5,
-            "priority_final_beta": 0.5,
-            "priority_alpha": 0.7,
+            "resets": {
+                "interval": 70,
+                "shrink_factor": 0.4,
+                "end": 0.8,
+                "initial_n_steps": 6,
+                "initial_gamma": 0.9,
+                "annealing_steps": 50,
+            },
+            "replay_buffer_kwargs": {"alpha": 0.7, "beta": 0.5, "final_beta": 0.5},
         },
         {
             "act_with_target": True,

@@ -35,7 +35,7 @@ import pandas as pd
 LOSSES = {
     "train/td_loss": "TD loss",
     "train/aet_loss": "AET loss",
-    "train/get_loss": "GET loss",
+    "train/symmetry_loss": "GET loss",
     "train/reward_loss": "reward loss",
 }
 EVALUATION_SECONDS = 60  # kept free at the end of the minutes

@@ -40,7 +40,7 @@ from sb3_eqr.benchmark.speed.clock import now, take_turns
 from sb3_eqr.benchmark.speed.floor import Floor
 from sb3_eqr.benchmark.speed.tables import Table
 from sb3_eqr.benchmark.speed.workload import EQR_AGENTS, STEPS_PER_CALL, close, fill, make_agent, train
-from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.common.save_util import atomic_write
 from sb3_eqr.envs import make_atari100k_env
 
 Job = argparse.Namespace  # the command line's, with `sizes` and `deadline`

@@ -88,7 +88,7 @@ def main() -> None:
                 group,
                 n_blocks=GROUPS[group],
                 total_timesteps=args.steps,
-                get_coef=1.0,
+                symmetry_coef=1.0,
                 state_dependent_actions=True,  # what a torque does to the angle depends on the velocity
                 seed=seed,
                 device="cpu",

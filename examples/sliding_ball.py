@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch.nn.functional import one_hot
 
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.common.save_util import atomic_write
 from sb3_eqr.envs import SlidingBall, register
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split

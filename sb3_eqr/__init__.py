@@ -1,8 +1,8 @@
 """EqR: equivariant representations for data-efficient reinforcement learning, on Stable-Baselines3."""
 
-from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
+from sb3_eqr.common.networks.group_encoder import GroupFeaturesExtractor
+from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.configurations import load_configuration
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.eqr_rainbow import EqRRainbow

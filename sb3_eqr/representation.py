@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
-from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.groups import Group
+from sb3_eqr.common.validation import check_number
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
@@ -63,7 +63,7 @@ def train_representation(
     batch_size: int = 64,
     prediction_depth: int = 5,
     aet_loss: str = "contrastive",
-    get_coef: float = 0.0,
+    symmetry_coef: float = 0.0,
     parameterization: str = "gram-schmidt",
     whiten: bool = True,
     state_dependent_actions: bool = False,
@@ -93,7 +93,7 @@ def train_representation(
     :param batch_size: windows per update; with the contrastive loss, one more than the negatives
     :param prediction_depth: M, how many steps ahead
     :param aet_loss: "contrastive" or "distance" (Eq. 18)
-    :param get_coef: weight of the GET loss; 0 as in Example 2
+    :param symmetry_coef: weight of the GET loss; 0 as in Example 2
     :param parameterization: of rotations among the states
     :param whiten: whether states are whitened
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, which makes angles linear in what is moved
@@ -130,9 +130,8 @@ def train_representation(
         exploration_fraction=1.0,
         exploration_final_eps=1.0,
         prediction_depth=prediction_depth,
-        aet_loss=aet_loss,
         td_coef=0.0,
-        get_coef=get_coef,
+        symmetry_coef=symmetry_coef,
         reward_coef=0.0,
         prioritized_replay=False,
         shift_pixels=0,  # a shift is what a world of moving things is about
@@ -143,6 +142,7 @@ def train_representation(
             "parameterization": parameterization,
             "whiten": whiten,
             "state_dependent_actions": state_dependent_actions,
+            "aet_loss": aet_loss,
             "projection": "none",
             "noisy": False,
             "dueling": False,

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.safe_files import get_rng_state
+from sb3_eqr.common.save_util import get_rng_state
 from sb3_eqr.visualize import animation
 from sb3_eqr.visualize.animation import predictions, record, shoot
 from sb3_eqr.visualize.callback import LatentCallback
@@ -163,7 +163,7 @@ def test_a_film_is_what_happened(make):
 @pytest.mark.parametrize("group", ["SE(2)", "SE(2)^2 x SO(3) x T(2)", "none", None])
 def test_files_have_the_frames_and_generators_are_kept(make, group, tmp_path):
     network = {"group": group, "n_blocks": None if group in (None, "SE(2)^2 x SO(3) x T(2)") else 3}
-    model = make(ChainEnv(8), get_coef=0, policy_kwargs=network)
+    model = make(ChainEnv(8), symmetry_coef=0, policy_kwargs=network)
     before = get_rng_state(model.action_space)
     paths = record(model, ChainEnv(8), tmp_path / "new" / "v1.5", 11, 3)
     after = get_rng_state(model.action_space)
@@ -183,7 +183,7 @@ def test_a_video_suffix_is_left_out(make, tmp_path):
 
 
 def test_blocks_are_numbered_from_zero(make):
-    model = make(ChainEnv(8), get_coef=0, policy_kwargs={"group": "SE(2)^2 x SO(3)", "n_blocks": None})
+    model = make(ChainEnv(8), symmetry_coef=0, policy_kwargs={"group": "SE(2)^2 x SO(3)", "n_blocks": None})
     states = encode(model, th.zeros(2, 3))
     assert [found.name for found in panels(model, states, states, 9)] == ["0 SE(2)", "1 SE(2)", "2 SO(3)"]
 
@@ -347,7 +347,7 @@ def test_nothing_is_looked_at_before_a_window_is_complete(make, tmp_path, monkey
 
 
 @EITHER
-@pytest.mark.parametrize("off", [{"prediction_depth": 0}, {"aet_coef": 0, "get_coef": 0, "reward_coef": 0}])
+@pytest.mark.parametrize("off", [{"prediction_depth": 0}, {"aet_coef": 0, "symmetry_coef": 0, "reward_coef": 0}])
 def test_an_agent_without_latent_losses_is_told_once(make, off):
     with pytest.warns(UserWarning, match="there is nothing to look at") as told:
         trained(make, LatentCallback(log_freq=10), **off)

@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.common.buffers import SequenceReplayBuffer
+from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 from sb3_eqr.envs.atari_batch import AtariBatch

@@ -10,8 +10,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
-from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
-from sb3_eqr.common.layers import ImpalaTrunk, NoisyLinear
+from sb3_eqr.common.networks.group_encoder import GroupFeaturesExtractor
+from sb3_eqr.common.networks.layers import NoisyLinear
+from sb3_eqr.common.networks.trunks import ImpalaTrunk
 from sb3_eqr.configurations import configuration_files
 from tests.toys import ImageEnv
 
@@ -138,7 +139,7 @@ def test_eqr_bbf_is_the_recipe():
     assert (model.priority_alpha, model.priority_beta, model.priority_final_beta) == (0.5, 0.5, 0.5)
     assert (model.initial_n_steps, model.n_steps, model.initial_gamma, model.gamma) == (10, 3, 0.97, 0.997)
     assert (model.annealing_steps, model.reset_interval, model.reset_shrink_factor) == (10_000, 40_000, 0.5)
-    assert (model.prediction_depth, model.aet_coef, model.get_coef) == (5, 5, 5)
+    assert (model.prediction_depth, model.aet_coef, model.symmetry_coef) == (5, 5, 5)
     assert (model.gradient_steps, model.train_freq.frequency, model.batch_size) == (2, 1, 32)
     assert model.policy.act_with_target and model.double_q
 

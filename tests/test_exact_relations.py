@@ -7,12 +7,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
-from sb3_eqr.common.features_extractor import ConvExtractor
+from sb3_eqr.common.networks.trunks import ConvExtractor
 from tests.toys import ChainEnv, ImageEnv
 
 OFF = {
     "aet_coef": 0.0,
-    "get_coef": 0.0,
+    "symmetry_coef": 0.0,
     "reward_coef": 0.0,
     "double_q": False,
     "prioritized_replay": False,
@@ -84,7 +84,7 @@ def test_the_group_encoder_is_a_plain_features_extractor():
     assert_same_networks(ours, theirs)
 
 
-@pytest.mark.parametrize("switched_off", ["aet_coef", "get_coef", "reward_coef", "prediction_depth"])
+@pytest.mark.parametrize("switched_off", ["aet_coef", "symmetry_coef", "reward_coef", "prediction_depth"])
 def test_each_switch_does_something(switched_off):
     """The relation above says nothing if the switches are not wired."""
     settings = {**SHARED, "n_steps": 3, "prediction_depth": 2, "target_update_interval": None}

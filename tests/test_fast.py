@@ -8,13 +8,13 @@ import sys
 import numpy as np
 import pytest
 import torch as th
+from sb3_eqr.common.captured_update import CapturedUpdate, StaticInputs
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-from sb3_eqr.common.buffers import SequenceReplayBuffer
-from sb3_eqr.common.captured_update import CapturedUpdate, StaticInputs
+from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
@@ -159,10 +159,10 @@ def test_few_graphs_are_kept(make, monkeypatch, fake_cuda):
 @EITHER
 def test_losses_that_come_and_go_keep_their_names(make, monkeypatch, fake_cuda):
     model = as_on_a_gpu(make(ChainEnv(), tau=0.9), monkeypatch).learn(60)
-    for get_coef, has_get in ((0.0, False), (1.0, True), (0.0, False)):
-        model.get_coef = get_coef
+    for symmetry_coef, has_get in ((0.0, False), (1.0, True), (0.0, False)):
+        model.symmetry_coef = symmetry_coef
         model.train(6, 8)
-        assert ("get_loss" in model._monitor.collect()) == has_get
+        assert ("symmetry_loss" in model._monitor.collect()) == has_get
 
 
 @EITHER

@@ -11,7 +11,7 @@ from sb3_eqr.common.groups import (
     guarded_inverse,
     make_group,
 )
-from sb3_eqr.common.rotations import euler_rotation, exp_rotation
+from sb3_eqr.common.groups.rotations import euler_rotation, exp_rotation
 
 AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
 
@@ -203,7 +203,7 @@ def test_no_group_lets_the_transition_predict_the_next_state():
     group = make_group("none(4)")
     left, right = th.randn(2, 3, 4)
     assert th.equal(group.compose(left, right), left)
-    with pytest.raises(ValueError, match="get_coef=0"):
+    with pytest.raises(ValueError, match="symmetry_coef=0"):
         group.inverse(left)
 
 

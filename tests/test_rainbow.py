@@ -10,9 +10,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRRainbow
-from sb3_eqr.common.features_extractor import ConvExtractor, ImpalaExtractor
-from sb3_eqr.common.layers import ImpalaTrunk, NoisyLinear, rescaled
-from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
+from sb3_eqr.common.networks.layers import NoisyLinear
+from sb3_eqr.common.networks.trunks import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
+from sb3_eqr.common.resets import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
@@ -458,7 +458,7 @@ def test_latents_are_scaled_to_the_unit_interval():
 @pytest.mark.parametrize("group", ["SE(2)", None])
 def test_trunks_by_name(make, group):
     network = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}, "group": group}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, get_coef=0.0).learn(60)
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, symmetry_coef=0.0).learn(60)
     encoder = model.policy.online.features_extractor
     assert isinstance(encoder if group is None else encoder.trunk, ImpalaExtractor)
     assert all(th.isfinite(p).all() for p in model.policy.parameters())

@@ -43,7 +43,7 @@ SCORES = {  # agent -> game -> final score of each seed; the mean of two episode
 
 
 def a_result(agent, game, seed, score):
-    losses = [{"step": step, "td_loss": 1.0, "aet_loss": 0.5, "get_loss": 0.25} for step in (4_000, 8_000)]
+    losses = [{"step": step, "td_loss": 1.0, "aet_loss": 0.5, "symmetry_loss": 0.25} for step in (4_000, 8_000)]
     return {
         "agent": agent,
         "game": game,

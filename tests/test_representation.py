@@ -105,9 +105,9 @@ def test_weight_of_the_td_loss(make):
     model.learn(41)
     logged = {
         name: model.logger.name_to_value[f"train/{name}"]
-        for name in ("loss", "td_loss", "aet_loss", "get_loss", "reward_loss")
+        for name in ("loss", "td_loss", "aet_loss", "symmetry_loss", "reward_loss")
     }
-    expected = 0.5 * logged["td_loss"] + 2 * logged["aet_loss"] + logged["get_loss"] + logged["reward_loss"]
+    expected = 0.5 * logged["td_loss"] + 2 * logged["aet_loss"] + logged["symmetry_loss"] + logged["reward_loss"]
     assert logged["loss"] == pytest.approx(expected, rel=1e-5)
 
 
@@ -128,7 +128,7 @@ def test_actions_that_do_not_depend_on_the_state():
         {"policy_kwargs": {"projection": "none"}},
         {"policy_kwargs": {"whiten": True}},
         {"policy_kwargs": {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}},
-        {"policy_kwargs": {"state_dependent_actions": False}, "aet_loss": "contrastive", "td_coef": 0.0, "get_coef": 0.0},
+        {"policy_kwargs": {"state_dependent_actions": False}, "aet_loss": "contrastive", "td_coef": 0.0, "symmetry_coef": 0.0},
         {"td_coef": 0.0, "aet_coef": 0.0},
     ],
     ids=str,
@@ -153,7 +153,7 @@ def test_what_is_not_legal():
     with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)
     with pytest.raises(ValueError, match="whiten: expected a group"):
-        EqRQRDQN("MlpPolicy", ChainEnv(), get_coef=0, policy_kwargs={"group": None, "whiten": True})
+        EqRQRDQN("MlpPolicy", ChainEnv(), symmetry_coef=0, policy_kwargs={"group": None, "whiten": True})
     with pytest.raises(ValueError, match=r"total_timesteps: expected more than .* = 3500, found 3000"):
         train_representation(Ring(), "SO(2)", policy="MlpPolicy", total_timesteps=3_000)
 

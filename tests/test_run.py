@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
-from sb3_eqr.common.features_extractor import ConvExtractor
+from sb3_eqr.common.networks.trunks import ConvExtractor
 from tests.models import EITHER, N_ATOMS, SMALL
 from tests.toys import ChainEnv, ImageEnv
 
@@ -54,8 +54,8 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
         {"n_steps": 1},
         {"n_steps": 10, "prediction_depth": 0},
         {"reward_loss": "categorical"},
-        {"get_coef": 0, "reward_coef": 0},
-        {"aet_coef": 0, "get_coef": 0},
+        {"symmetry_coef": 0, "reward_coef": 0},
+        {"aet_coef": 0, "symmetry_coef": 0},
         {"aet_coef": 0, "reward_coef": 0},
         {"double_q": False, "prioritized_replay": False, "tau": 0.01},
         {"target_update_interval": 30},
@@ -66,8 +66,8 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
         {"policy_kwargs": {"group": "GL(2)"}},
         {"policy_kwargs": {"group": "SO(3)", "parameterization": "exp"}},
         {"policy_kwargs": {"group": "SE(2)^2 x SO(3)", "n_blocks": None}},
-        {"policy_kwargs": {"group": "none(8)", "n_blocks": None}, "get_coef": 0},
-        {"policy_kwargs": {"group": None}, "get_coef": 0},
+        {"policy_kwargs": {"group": "none(8)", "n_blocks": None}, "symmetry_coef": 0},
+        {"policy_kwargs": {"group": None}, "symmetry_coef": 0},
         {"policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.1}}},
         {"learning_rate": lambda progress: 1e-3 * progress, "max_grad_norm": None},
         {"replay_buffer_class": SequenceReplayBuffer, "learning_starts": 0},
@@ -127,7 +127,7 @@ def test_defaults_are_those_of_table_5(make):
     assert (model.train_freq.frequency, model.train_freq.unit.value, model.tau) == (1, "step", 1.0)
     assert (model.priority_alpha, model.priority_beta) == (0.5, 0.4)
     assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
-    assert (model.aet_coef, model.get_coef, model.reward_coef) == (1, 1, 1)
+    assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (1, 1, 1)
     assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
     adam = model.policy.optimizer.defaults
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
@@ -197,7 +197,7 @@ class OwnConvolutions(ConvExtractor):
 @pytest.mark.parametrize("group", ["SE(2)", None])
 def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
     network = {"features_extractor_class": OwnConvolutions, "group": group}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, get_coef=0.0)
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, symmetry_coef=0.0)
     assert model.predict(model.get_env().reset())[0].shape == (1,)
 
 
@@ -461,7 +461,7 @@ def test_logger_has_every_key_and_reads_only_when_dumped(make, tmp_path, monkeyp
     recorded = {}
     monkeypatch.setattr(model.logger, "dump", lambda step=0: recorded.update(model.logger.name_to_value))
     model.learn(100, log_interval=1)
-    losses = {"td_loss", "aet_loss", "get_loss", "reward_loss", "loss", "grad_norm", "mean_q_value"}
+    losses = {"td_loss", "aet_loss", "symmetry_loss", "reward_loss", "loss", "grad_norm", "mean_q_value"}
     keys = {f"train/{name}" for name in losses} | {"train/beta", "train/n_updates", "train/learning_rate"}
     assert keys <= recorded.keys()
     assert {"rollout/ep_rew_mean", "rollout/exploration_rate", "time/fps"} <= recorded.keys()

@@ -86,7 +86,12 @@ def test_switches_can_be_changed_on_loading(make, tmp_path):
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
     loaded.learn(60)
     assert loaded.replay_buffer.n_steps == 5
-    for change in ({"get_coef": 0.0}, {"reward_coef": 0.0}, {"prediction_depth": 0}, {"aet_coef": 0.0, "double_q": False}):
+    for change in (
+        {"symmetry_coef": 0.0},
+        {"reward_coef": 0.0},
+        {"prediction_depth": 0},
+        {"aet_coef": 0.0, "double_q": False},
+    ):
         make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
     make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
     richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)

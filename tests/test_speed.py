@@ -18,7 +18,7 @@ from sb3_eqr.benchmark.speed.steps import update_stages
 from sb3_eqr.benchmark.speed.stopwatch import REST, Stage, Stopwatch, break_down
 from sb3_eqr.benchmark.speed.tables import Sweep, Table, growth, verdict
 from sb3_eqr.benchmark.speed.workload import DEPTH_0, EQR_AGENTS, fill, make_agent, make_trainable, train
-from sb3_eqr.common.layers import ConvTrunk, ImpalaTrunk
+from sb3_eqr.common.networks.trunks import ConvTrunk, ImpalaTrunk
 
 # --- the floor -----------------------------------------------------------------------------------------------------------
 

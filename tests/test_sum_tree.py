@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sb3_eqr.common.sum_tree import SumTree
+from sb3_eqr.common.replay.sum_tree import SumTree
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 3, 7, 64, 65, 100, 1000])

@@ -173,7 +173,7 @@ def test_every_group(group):
     n_blocks = None if whole else 3
     algorithm = EqRRainbow if whole else EqRQRDQN
     inverse = group is not None and not str(group).startswith("none")
-    model = make_model(algorithm, group=group, n_blocks=n_blocks, get_coef=float(inverse))
+    model = make_model(algorithm, group=group, n_blocks=n_blocks, symmetry_coef=float(inverse))
     windows = play(model, make_vec_env(Ring), 120, depth=3)
     found = diagnose(model, windows)
     k = {None: 1, "none(5)": 1, "SE(2)^3 x SO(3)^2 x T(2)": 6}.get(group, 3)

@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
+from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 
 PREFIX = "checkpoint-"  # and the step
 

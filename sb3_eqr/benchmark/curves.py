@@ -73,8 +73,8 @@ def symmetry_losses(comparison: Comparison) -> dict[str, dict[str, tuple[np.ndar
 
 
 def _symmetry_loss(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    rows = [row for row in result.get("losses", []) if "aet_loss" in row or "get_loss" in row]
-    values = [row.get("aet_loss", 0.0) + row.get("get_loss", 0.0) for row in rows]
+    rows = [row for row in result.get("losses", []) if "aet_loss" in row or "symmetry_loss" in row]
+    values = [row.get("aet_loss", 0.0) + row.get("symmetry_loss", 0.0) for row in rows]
     return np.array([row["step"] for row in rows]), np.array(values)
 
 

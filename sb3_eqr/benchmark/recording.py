@@ -11,6 +11,7 @@ from stable_baselines3.common.logger import KVWriter
 from sb3_eqr.benchmark.checkpoints import write_checkpoint
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.run import PROGRESS, Run, Settings, write_json
+from sb3_eqr.common.resets import Resets
 
 PROGRESS_SECONDS = 2.0  # between two notes of where a run is
 
@@ -107,8 +108,10 @@ class RunCallback(BaseCallback):
         :return: whether half of the updates from one reset of the network to the next are done; a network that has just been
             reset plays like a new one
         """
-        interval = getattr(self.model, "reset_interval", None)
-        return interval is None or not self.model._resets or 2 * self.model._updates_since_reset >= interval  # type: ignore[attr-defined]
+        resets: Resets | None = getattr(self.model, "_resets", None)
+        if resets is None or resets.schedule.interval is None or not resets.done:
+            return True
+        return 2 * resets.updates_since(self.model._n_updates) >= resets.schedule.interval  # type: ignore[attr-defined]
 
     def note_progress(self) -> None:
         """Write where the run is, for the table."""

@@ -10,8 +10,8 @@ import yaml
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
-from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.validation import check_number
 from sb3_eqr.zoo.checks import nearest
 
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")

@@ -1,66 +1,348 @@
-"""The one training loop of every EqR agent (Algorithm 1)."""
+"""The algorithm: its arguments, what it is made of, and the one training loop of every EqR agent (Algorithm 1)."""
 
+import inspect
 import io
 import pathlib
-from abc import abstractmethod
+import warnings
 from collections.abc import Callable
-from math import ceil
-from typing import NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.utils import LinearSchedule, get_device
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 
-from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-from sb3_eqr.common.features_extractor import GroupFeaturesExtractor
-from sb3_eqr.common.layers import Whitening
-from sb3_eqr.common.networks import EqRNetwork
-from sb3_eqr.common.preprocessing import ImageAugmentation
-from sb3_eqr.common.schedules import anneal_gamma, anneal_n_steps
+from sb3_eqr.common.cuda_graph import CapturedGradients
+from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
+from sb3_eqr.common.policies import EqRPolicy, find_optimizer
+from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.resets import Resets, ResetSchedule
+from sb3_eqr.common.save_util import SafeFiles, read_description
 from sb3_eqr.common.transfer import load_representation, representation
-from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
-from sb3_eqr.common.update_rounds import UpdateRounds
+from sb3_eqr.common.validation import (
+    answers_misspelt,
+    check_action_space,
+    check_finite,
+    check_losses,
+    check_names,
+    check_normalization,
+    check_number,
+    check_policy,
+    check_replay,
+    check_same_parameters,
+)
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
+# argument -> smallest and largest legal value, whether it is an integer
+RANGES: dict[str, tuple[float, float, bool]] = {
+    "prediction_depth": (0, np.inf, True),
+    "shift_pixels": (0, np.inf, True),
+    "td_coef": (0, np.inf, False),
+    "aet_coef": (0, np.inf, False),
+    "symmetry_coef": (0, np.inf, False),
+    "reward_coef": (0, np.inf, False),
+    "intensity_scale": (0, np.inf, False),
+    "tau": (0, 1, False),
+    "batch_size": (1, np.inf, True),
+}
+# Arguments of the replay buffer that are arguments of the algorithm, which moves them.
+SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
 
-_PIECE = 2 << 20  # numbers in the observations of one pass on a CPU: 8 MiB as floats, 74 stacks of Atari frames
 
-
-class TDLoss(NamedTuple):
-    """What a Q head makes of a batch of B samples."""
-
-    loss: th.Tensor  # (B,)
-    priorities: th.Tensor  # (B,), ≥ 0, no gradient
-    q_values: th.Tensor  # (B,), Q(s_t, a_t), no gradient
-
-
-class EqRAlgorithm(UpdateRounds):
+class EqRAlgorithm(SafeFiles):
     """
-    Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, the auxiliary losses beside the TD loss,
-    one backward, one clip, one step, the target, the priorities. A subclass adds the Q head by :meth:`_td_loss`.
+    Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, auxiliary losses beside the TD loss, one backward,
+    one clip, one step, the target, the priorities. The head and its loss are those of the policy's networks.
     """
+
+    policy: EqRPolicy
+    replay_buffer: SequenceReplayBuffer | None
+    replay_buffer_class: type[SequenceReplayBuffer] | None
+    target_update_interval: int | None
+    max_grad_norm: float | None
+    exploration_schedule: Schedule
+    exploration_rate: float
+    exploration_initial_eps: float
+    exploration_final_eps: float
+    exploration_fraction: float
+    _n_calls: int
+    _create_aliases: Callable[[], None]  # of the stock algorithm: its own names of the networks
+    frame_stack = 1
+
+    @answers_misspelt
+    def __init__(
+        self,
+        policy: str | type[EqRPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 2_000,
+        batch_size: int = 32,
+        tau: float = 1.0,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 2,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 10,
+        target_update_interval: int | None = None,
+        exploration_fraction: float = 0.02,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.0,
+        max_grad_norm: float | None = 10.0,
+        prediction_depth: int = 5,
+        aet_coef: float = 1.0,
+        symmetry_coef: float = 1.0,
+        reward_coef: float = 1.0,
+        td_coef: float = 1.0,
+        double_q: bool = True,
+        prioritized_replay: bool = True,
+        shift_pixels: int = 4,
+        intensity_scale: float = 0.05,
+        resets: ResetSchedule | dict[str, Any] | None = None,
+        cuda_graph: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        """
+        Default hyperparameters are those of the paper for Atari 100K (Table 5).
+
+        :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+        :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
+        :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
+        :param buffer_size: size of the replay buffer, over all environments; per environment at least n + M + 1
+        :param learning_starts: how many steps of the model to collect transitions for before learning starts
+        :param batch_size: Minibatch size for each gradient update
+        :param tau: how far the target moves at each target update, in [0, 1]; 1 copies the online networks
+        :param gamma: the discount factor
+        :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+            like ``(5, "step")`` or ``(2, "episode")``.
+        :param gradient_steps: How many gradient steps to do after each rollout; -1: as many as steps done in the environment
+        :param replay_buffer_class: a class derived from ``SequenceReplayBuffer``; ``None``: chosen by ``prioritized_replay``
+        :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation: ``alpha``, ``beta`` and
+            ``final_beta`` of :class:`~sb3_eqr.common.replay.buffers.PrioritizedSequenceReplayBuffer`; ``frame_stack``, how
+            many frames an image observation stacks (found where ``VecFrameStack`` is used)
+        :param optimize_memory_usage: has no effect: memory is always saved
+        :param n_steps: n of the n-step return
+        :param target_update_interval: update the target every so many environment steps, as QRDQN and DQN do;
+            ``None``: after every gradient step, as the paper asks
+        :param exploration_fraction: fraction of entire training period over which the exploration rate is reduced;
+            2,000 of 100,000 steps, after which the noisy layers explore
+        :param exploration_initial_eps: initial value of random action probability; above 1 the actions are random until the
+            line has come down to 1
+        :param exploration_final_eps: final value of random action probability
+        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
+        :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
+        :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss; 0 switches it off
+        :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
+        :param reward_coef: λ₁ ≥ 0, weight of the reward loss; 0 switches it off
+        :param td_coef: weight of the TD loss; 0: no Q-learning, the representation alone is trained
+            (:func:`~sb3_eqr.representation.train_representation`), and replay priorities stay as they are
+        :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
+        :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
+        :param shift_pixels: random shift of images, in pixels; 0 switches it off
+        :param intensity_scale: random intensity of images; 0 switches it off
+        :param resets: periodic resets, and n and γ that are annealed: a :class:`~sb3_eqr.common.resets.ResetSchedule`, or
+            its fields as a dictionary; ``None``: neither
+        :param cuda_graph: experimental, and not measured on a GPU yet: losses and gradients of an update as one CUDA graph,
+            with the same numbers but for rounding (:mod:`sb3_eqr.common.cuda_graph`); a warning says why it falls back
+        :param stats_window_size: Window size for the rollout logging
+        :param tensorboard_log: the log location for tensorboard (if None, no logging)
+        :param policy_kwargs: additional arguments to be passed to the policy on creation, see
+            :class:`~sb3_eqr.common.policies.EqRPolicy`
+        :param verbose: the verbosity level: 0 no output, 1 info, 2 debug
+        :param seed: Seed for the pseudo random generators
+        :param device: Device (cpu, cuda, ...) on which the code should be run.
+            Setting it to auto, the code will be run on the GPU if possible.
+        :param _init_setup_model: Whether or not to build the network at the creation of the instance
+        :raises ValueError: for an argument out of its range
+        :raises TypeError: for an argument that there is not, with the nearest one that there is
+        :raises AssertionError: if the action space is not Discrete (as SB3)
+        """
+        del optimize_memory_usage  # kept so that SB3's arguments fit
+        # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
+        policy_kwargs = dict(policy_kwargs or {})
+        policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
+        if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
+            # Epsilon of Table 5; one kernel for all parameters, on CPU and GPU, where PyTorch's default has six for each.
+            given = policy_kwargs.get("optimizer_kwargs") or {}
+            fused = get_device(device).type in ("cpu", "cuda") and not (given.get("foreach") or given.get("differentiable"))
+            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, "fused": fused, **given}
+        super().__init__(  # type: ignore[call-arg]
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
+            n_steps=n_steps,
+            target_update_interval=target_update_interval,
+            exploration_fraction=exploration_fraction,
+            exploration_initial_eps=exploration_initial_eps,
+            exploration_final_eps=exploration_final_eps,
+            max_grad_norm=max_grad_norm,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.prediction_depth = prediction_depth
+        self.aet_coef = aet_coef
+        self.symmetry_coef = symmetry_coef
+        self.reward_coef = reward_coef
+        self.td_coef = td_coef
+        self.double_q = double_q
+        self.prioritized_replay = prioritized_replay
+        self.shift_pixels = shift_pixels
+        self.intensity_scale = intensity_scale
+        self.resets = resets
+        self.cuda_graph = cuda_graph
+        self.policy_description: dict[str, str] = {}  # saved beside the parameters, see EqRPolicy.description
+        self.representation_frozen = False  # by load_representation; survives saving
+        self._resets = Resets(ResetSchedule.of(resets))  # survives saving
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------------------------------------------- set-up
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        """
+        Instead of SB3's, in the same order: SB3's refuses n-step replay of dict observations and a target per gradient step.
+        """
+        self._check_arguments()
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.env is not None:
+            self.frame_stack = self._find_frame_stack()
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        self.policy = self._make_policy()
+        self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
+        saved, self.policy_description = self.policy_description, self.policy.description
+        check_same_parameters(self.policy_description, saved)
+        self._convert_train_freq()
+        self._create_aliases()
+        self.exploration_schedule = LinearSchedule(
+            self.exploration_initial_eps, self.exploration_final_eps, self.exploration_fraction
+        )
         if self.representation_frozen:
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
-        encoder_modules = self.policy.online.features_extractor.modules()
-        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
-        self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder_modules)
-        self._target_is_copy = True  # it is built as one
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
-        self._augment = ImageAugmentation(
-            self.observation_space, self.policy.normalize_images, self.shift_pixels, self.intensity_scale
-        )
+        self.objective = Objective(self.policy, self.double_q, self.shift_pixels, self.intensity_scale)
+        self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
+        keep_freed_memory()
+
+    def _check_arguments(self) -> None:
+        name = type(self).__name__
+        check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
+        check_normalization(self._vec_normalize_env, self.observation_space)
+        check_replay(name, self.replay_buffer_class, SequenceReplayBuffer, self.replay_buffer_kwargs, SET_BY_ALGORITHM)
+        for argument, (low, high, whole) in RANGES.items():
+            check_number(argument, getattr(self, argument), low, high, whole)
+        if self.target_update_interval is not None:
+            check_number("target_update_interval", self.target_update_interval, 1, whole=True)
+        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
+        check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        noisy = self.policy_kwargs.get("noisy", True)
+        if self.exploration_final_eps == 0 and not noisy and self.resets.interval is None:  # resets explore, too
+            warnings.warn(
+                "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
+                "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
+            )
 
     @property
-    def _target_is_online(self) -> bool:
-        """Whether target features are online features, so that one pass serves for both."""
-        return self._target_is_copy and self._encoder_ignores_mode
+    def depth(self) -> int:
+        """M as it is used: 0 where no auxiliary loss is on."""
+        return self.prediction_depth if self.aet_coef or self.symmetry_coef or self.reward_coef else 0
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        check_action_space(wrapped.action_space)
+        return wrapped
+
+    def _make_policy(self) -> EqRPolicy:
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        assert isinstance(policy, EqRPolicy)
+        return policy.to(self.device)
+
+    def _make_replay_buffer(self) -> SequenceReplayBuffer:
+        default = PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
+        buffer_class = self.replay_buffer_class or default
+        legal = inspect.signature(buffer_class).parameters
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in legal.values()):
+            check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
+        kwargs = {
+            "n_steps": max(self.n_steps, self._resets.schedule.initial_n_steps or 0),  # the longest that it must hold
+            "gamma": self.gamma,
+            "prediction_depth": self.depth,
+            **self.replay_buffer_kwargs,
+            "frame_stack": self.frame_stack,
+        }
+        return buffer_class(
+            self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
+        )
+
+    def _find_frame_stack(self) -> int:
+        found = 1
+        stack = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
+        if isinstance(stack, VecFrameStack) and is_image_space(self.observation_space):
+            # Frames lie side by side along the first axis only if channels were what was stacked.
+            channels_first = is_image_space_channels_first(stack.venv.observation_space)  # type: ignore[arg-type]
+            if stack.stacked_obs.channels_first == channels_first:
+                found = stack.stacked_obs.n_stack
+        return self.replay_buffer_kwargs.get("frame_stack", found)
+
+    # ------------------------------------------------------------------------------------------------ environment
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
+        return result
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
+        normalize, step = self._vec_normalize_env, self.num_timesteps
+        try:
+            check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
+            check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
+            for info in infos:
+                check_finite("terminal observation", info.get("terminal_observation", 0), step)
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        except ValueError:
+            self._last_obs = None  # the environment has moved on: another call of learn must reset it
+            raise
 
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
@@ -71,194 +353,84 @@ class EqRAlgorithm(UpdateRounds):
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
-    def _train(self, gradient_steps: int, batch_size: int) -> None:
-        buffer = self.replay_buffer
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last round may end beyond the total. A schedule that is a line, such as RL Zoo's, would give a learning rate
+        # below 0 there, which is gradient ascent.
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
+    # --------------------------------------------------------------------------------------------------- training
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        A round of updates (Algorithm 1).
+
+        :param gradient_steps: number of updates
+        :param batch_size: B
+        """
+        buffer, policy, optimizer = self.replay_buffer, self.policy, self.policy.optimizer
         assert buffer is not None
-        captures = self._captures()
-        self._late.write_back()
-        self._collect_metrics()
-        remaining = self._current_progress_remaining
+        self._start_round(buffer)
+        for _ in range(gradient_steps):
+            if self._resets.is_due(self._n_updates, self._current_progress_remaining):
+                self._reset()
+            buffer.n_steps, buffer.gamma = self._resets.annealed(self._n_updates, self.n_steps, self.gamma)
+            buffer.prediction_depth = self.depth
+            if not buffer.can_sample():
+                break  # the first window is not complete yet
+            samples = buffer.sample(batch_size, env=self._vec_normalize_env)
+            coefs = LossCoefs(self.td_coef, self.aet_coef, self.symmetry_coef, self.reward_coef)
+            optimizer.zero_grad()
+            if self._captured is not None:
+                terms = self._captured(samples, coefs)  # the two lines below, as one CUDA graph
+            else:
+                terms = self.objective(samples, coefs)
+                terms.loss.backward()
+            max_norm = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+            grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
+            optimizer.step()
+            self._n_updates += 1
+            policy.target_is_copy = False
+            if self.target_update_interval is None:
+                policy.update_target(self.tau)
+            if terms.priorities is not None:
+                buffer.update_priorities(samples.indices, terms.priorities)
+            self._monitor.add({**terms.metrics(), "grad_norm": grad_norm})
+        self._log_counts(buffer)
+
+    def _start_round(self, buffer: SequenceReplayBuffer) -> None:
+        self._log_last_round()
         if isinstance(buffer, PrioritizedSequenceReplayBuffer):
-            buffer.beta = self.priority_final_beta + (self.priority_beta - self.priority_final_beta) * remaining
+            buffer.anneal_beta(self._current_progress_remaining)
             self.logger.record("train/beta", buffer.beta)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         self._monitor.start_round(self._n_updates)
-        for _ in range(gradient_steps):
-            if self._reset_is_due():
-                self._reset()
-            self._set_window(buffer)
-            if not buffer.can_sample():
-                break  # the first window is not complete yet
-            self._late.write_back(but=1)
-            if captures:
-                self._run_captured(buffer.draw(batch_size))
-            else:
-                self._update(buffer.sample(batch_size, env=self._vec_normalize_env))
-        if self.reset_interval is not None:
-            self.logger.record("train/n_resets", len(self._resets))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _set_window(self, buffer: SequenceReplayBuffer) -> None:
-        """n, γ and M as they are now: a schedule or a callback may have moved them."""
-        progress = min(self._updates_since_reset / self.annealing_steps, 1.0)
-        buffer.n_steps = anneal_n_steps(self.initial_n_steps, self.n_steps, progress)
-        buffer.gamma = anneal_gamma(self.initial_gamma, self.gamma, progress)
-        buffer.prediction_depth = self.depth
-        for name in ("n_steps", "gamma"):
-            if getattr(self, f"initial_{name}") is not None:
-                self.logger.record(f"train/{name}", getattr(buffer, name))
-
-    @property
-    def _updates_since_reset(self) -> int:
-        return self._n_updates - (self._resets[-1] if self._resets else 0)
-
-    def _reset_is_due(self) -> bool:
-        over = 1.0 - self._current_progress_remaining >= self.reset_fraction
-        return self.reset_interval is not None and self._updates_since_reset >= self.reset_interval and not over
 
     def _reset(self) -> None:
-        self._captured.forget()
-        self.policy.reset_parameters(self._make_policy(), self.reset_shrink_factor)
-        self._target_is_copy = True
-        self._resets.append(self._n_updates)
+        self.policy.reset_parameters(self._make_policy(), self._resets.schedule.shrink_factor)
+        self._resets.done.append(self._n_updates)
 
-    def _update(self, samples: SequenceReplayBufferSamples) -> None:
-        """One gradient step, the target, the priorities."""
-        self._record(samples.indices, self._update_networks(samples))
+    def _log_counts(self, buffer: SequenceReplayBuffer) -> None:
+        schedule = self._resets.schedule
+        if schedule.initial_n_steps is not None:
+            self.logger.record("train/n_steps", buffer.n_steps)
+        if schedule.initial_gamma is not None:
+            self.logger.record("train/gamma", buffer.gamma)
+        if schedule.interval is not None:
+            self.logger.record("train/n_resets", len(self._resets.done))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _update_networks(self, samples: SequenceReplayBufferSamples) -> dict[str, th.Tensor]:
-        """
-        All of an update that the device does.
-
-        :return: what the monitor shows, scalars by name, and new "priorities", (B,), where there is a TD loss
-        """
-        td, auxiliary = self._compute_losses(samples)
-        parts = {"td": None if td is None else td.loss, **auxiliary._asdict()}
-        weighted = [getattr(self, f"{name}_coef") * part for name, part in parts.items() if part is not None]
-        loss = (samples.weights * sum(weighted[1:], weighted[0])).mean()
-
-        self.policy.optimizer.zero_grad()
-        loss.backward()
-        max_norm = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-        grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
-        self.policy.optimizer.step()
-        if self.target_update_interval is None:
-            self.policy.update_target(self.tau)
-        with th.no_grad():
-            figures = {f"{name}_loss": part.mean() for name, part in parts.items() if part is not None}
-            figures.update(loss=loss.detach(), grad_norm=grad_norm)
-            if td is not None:
-                figures["mean_q_value"] = td.q_values.mean()
-        return figures if td is None else {**figures, "priorities": td.priorities}
-
-    def _record(self, indices: np.ndarray, outputs: dict[str, th.Tensor]) -> None:
-        """
-        All of an update that the host does.
-
-        :param indices: of the samples in the replay buffer, (B,)
-        :param outputs: of :meth:`_update_networks`
-        """
-        self._n_updates += 1
-        self._target_is_copy = self.target_update_interval is None and self.tau == 1.0
-        self._monitor.add({name: figure for name, figure in outputs.items() if name != "priorities"})
-        if "priorities" in outputs and isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer):
-            self._late.add(self.replay_buffer, indices, outputs["priorities"])
-            if self.fast != "overlap":
-                self._late.write_back()
-
-    def _compute_losses(self, samples: SequenceReplayBufferSamples) -> tuple[TDLoss | None, LatentLosses]:
-        """
-        One features pass for s_t serves both.
-
-        :return: losses per sample; no TD loss where it is off
-        """
-        policy = self.policy
-        observations = self._augment(samples.observations)
-        features = self._encode(policy.online, observations)  # (B, D)
-        td = self._q_learning(samples, features) if self.td_coef > 0 else None
-        if samples.mask is None:
-            return td, LatentLosses(None, None, None)
-        with th.no_grad():
-            target_states = features.detach() if self._target_is_online else self._encode(policy.target, observations)
-            target_states = target_states[:, None]
-            if samples.rollout_observations is not None and self._uses_aet:
-                flat = _map(lambda obs: obs.flatten(0, 1), samples.rollout_observations)  # (B * M, ...)
-                pieces = [self._encode(policy.target, self._augment(piece)) for piece in self._pieces(flat)]
-                rollout = th.cat(pieces).unflatten(0, samples.mask.shape)  # (B, M, D)
-                target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
-        auxiliary = policy.latent_model(
-            features,
-            samples.rollout_actions,
-            samples.rollout_rewards if self.reward_coef > 0 else None,
-            samples.mask,
-            target_states,
-            policy.latent_model_target if self.get_coef > 0 else None,
-            policy.project if self._uses_aet else None,
-            policy.target_project,
-        )
-        return td, auxiliary
-
-    def _encode(self, network: EqRNetwork, observations: PyTorchObs) -> th.Tensor:
-        if not self.bf16:
-            return network.encode(observations)
-        encoder = network.features_extractor
-        trunk = encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder
-        with th.autocast(self.device.type, th.bfloat16, cache_enabled=False):
-            features = trunk(observations).float()
-        # Angles and their products need all their digits.
-        return encoder.elements(features) if isinstance(encoder, GroupFeaturesExtractor) else features
-
-    def _pieces(self, observations: PyTorchObs) -> list[PyTorchObs]:
-        """
-        What a pass without gradient takes at a time: on a CPU so much as its caches hold, in blocks of memory that the C
-        library keeps, whatever M; elsewhere everything.
-
-        :param observations: (N, ...)
-        """
-        if self.device.type != "cpu":
-            return [observations]
-        tensors = list(observations.values()) if isinstance(observations, dict) else [observations]
-        n_pieces = ceil(sum(tensor.numel() for tensor in tensors) / _PIECE)
-        at_a_time = ceil(len(tensors[0]) / n_pieces)
-        if isinstance(observations, dict):
-            pieces = zip(*(tensor.split(at_a_time) for tensor in tensors), strict=True)
-            return [dict(zip(observations, piece, strict=True)) for piece in pieces]
-        return list(observations.split(at_a_time))
-
-    def _q_learning(self, samples: SequenceReplayBufferSamples, features: th.Tensor) -> TDLoss:
-        """
-        :param samples: the batch
-        :param features: of s_t, online, (B, D)
-        """
-        online, target = self.policy.online, self.policy.target
-        with th.no_grad():
-            next_observations = self._augment(samples.next_observations)
-            next_target = next_online = self._encode(target, next_observations)  # (B, D)
-            if self.double_q and not self._target_is_online:
-                next_online = self._encode(online, next_observations)
-            next_outputs = target.head(next_target, noisy=True)  # (B, N, A)
-            chooser = online.head(next_online, noisy=True) if self.double_q else next_outputs
-            next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
-            following = _of_actions(next_outputs, next_actions)  # (B, N)
-            discounts = (1 - samples.dones) * samples.discounts  # (B, 1)
-        current = _of_actions(online.head(features, noisy=True), samples.actions.long())  # (B, N)
-        loss, priorities = self._td_loss(current, following, samples.rewards, discounts)
-        return TDLoss(loss, priorities, online.expectation(current.detach()))
-
-    @abstractmethod
-    def _td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        The Q head's own loss.
-
-        :param current: outputs of the online head for (s_t, a_t), (B, N)
-        :param following: those of the target head after the n-step transition, for the best action, no gradient, (B, N)
-        :param rewards: the n-step return, (B, 1)
-        :param discounts: 0 where the transition ended in a terminal state, γ to its length elsewhere, (B, 1)
-        :return: loss, (B,), and priorities ≥ 0 without gradient, (B,)
-        """
+    def _log_last_round(self) -> None:
+        """Log the metrics of the last round, which are computed by now; roll back if one is not finite."""
+        try:
+            for name, value in self._monitor.collect().items():
+                self.logger.record_mean(f"train/{name}", value)
+        except BadUpdateError as error:
+            self._n_updates = error.n_updates
+            self._resets.roll_back(error.n_updates)
+            self.policy.target_is_copy = False
+            raise
 
     def learn(
         self: SelfEqRAlgorithm,
@@ -271,34 +443,27 @@ class EqRAlgorithm(UpdateRounds):
     ) -> SelfEqRAlgorithm:
         """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
         tb_log_name = tb_log_name or type(self).__name__
-        with self._rounds_may_wait():
-            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        self._collect_metrics()
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._log_last_round()
         return self
-
-    def _collect_metrics(self) -> None:
-        """Log the figures of the last round, which are computed by now; roll back if one is not finite."""
-        try:
-            for name, value in self._monitor.collect().items():
-                self.logger.record_mean(f"train/{name}", value)
-        except BadUpdateError as error:
-            self._n_updates = error.n_updates
-            self._resets = [reset for reset in self._resets if reset < error.n_updates]  # later ones were put back, too
-            self._target_is_copy = False
-            self._captured.forget()
-            raise
 
     def dump_logs(self) -> None:
         """Write log data; losses are means over all updates since the last time."""
-        self._collect_metrics()
+        self._log_last_round()
         super().dump_logs()
+
+    # --------------------------------------------------------------------------------------------------- parameters
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """As SB3's ``set_parameters``, with the same parameters."""
-        self._target_is_copy = False  # nothing is known of them
-        self._captured.forget()
+        """
+        As SB3's ``set_parameters``, with the same parameters.
+
+        :raises ValueError: for a file with parameters for another group or another return distribution
+        """
+        if not isinstance(load_path_or_dict, dict):
+            check_same_parameters(self.policy_description, read_description(load_path_or_dict))
         self._monitor.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
         for parameter, state in self.policy.optimizer.state.items():
@@ -314,7 +479,7 @@ class EqRAlgorithm(UpdateRounds):
         predictor stay this agent's own. The tasks must have the same observations and actions (paper, §4).
 
         :param path: what ``save`` of either agent wrote, or of :func:`~sb3_eqr.representation.train_representation`
-        :param freeze: whether they stay as they are from now on; ``aet_coef=0, get_coef=0`` then saves their time
+        :param freeze: whether they stay as they are from now on; ``aet_coef=0, symmetry_coef=0`` then saves their time
         :return: this agent
         :raises ValueError: if it does not fit: another group, trunk or number of actions; nothing is changed then
         """
@@ -322,8 +487,7 @@ class EqRAlgorithm(UpdateRounds):
             raise ValueError(
                 "freeze: expected a loss that trains something else, found td_coef=0 and no reward loss. Pass freeze=False."
             )
-        self._collect_metrics()
-        self._captured.forget()
+        self._log_last_round()
         load_representation(self.policy, path)
         self.representation_frozen = freeze
         self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
@@ -331,30 +495,7 @@ class EqRAlgorithm(UpdateRounds):
         return self
 
     def _before_saving(self) -> None:
-        self._late.write_back()
-        self._collect_metrics()  # a model whose last update went wrong is put back and not saved
+        self._log_last_round()  # a model whose last update went wrong is put back and not saved
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_monitor",
-            "_trained",
-            "_encoder_ignores_mode",
-            "_target_is_copy",
-            "_augment",
-        ]
-
-
-def _of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    :param outputs: of a head, (B, N, A)
-    :param actions: (B, 1), int64
-    :return: (B, N)
-    """
-    return outputs.gather(dim=2, index=actions[..., None].expand(-1, outputs.shape[1], 1)).squeeze(dim=2)
-
-
-def _map(function: Callable[[th.Tensor], th.Tensor], observations: PyTorchObs) -> PyTorchObs:
-    if isinstance(observations, dict):
-        return {key: function(obs) for key, obs in observations.items()}
-    return function(observations)
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "objective", "_captured"]

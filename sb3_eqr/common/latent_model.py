@@ -65,7 +65,7 @@ class LatentModel(nn.Module):
         self.transition = _hidden_layer(state_dim * state_dependent_actions + n_actions, hidden_dim, algebra_dim)  # κ
         if not state_dependent_actions:
             self.transition[1] = nn.Identity()  # statistics of a batch of actions would move κ(a) with the draw
-        self._aet_loss = AET_LOSSES[aet_loss]
+        self.aet_loss = aet_loss
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
         self.reward_net = _hidden_layer(state_dim, hidden_dim, n_outputs)  # r_ψ
         self.action_symmetry = _hidden_layer(state_dim, hidden_dim, algebra_dim)  # ρ
@@ -100,17 +100,18 @@ class LatentModel(nn.Module):
         # Past the end there is no action: a constant one keeps the mask's promise even through batch statistics.
         one_hot = F.one_hot((actions * mask.long()).long(), self.n_actions).to(state.dtype)  # (B, M, A)
         predicted = self.rollout(state, one_hot, mask)  # (B, M, D)
-        aet = get = reward = None
+        aet = symmetry = reward = None
         if project is not None:
             with th.no_grad():
                 target_projected = target_project(target_states[:, 1:])  # (B, M, P)
-            aet = (self._aet_loss(project(predicted), target_projected, mask) * mask).sum(dim=1)
+            aet = (AET_LOSSES[self.aet_loss](project(predicted), target_projected, mask) * mask).sum(dim=1)
         if target is not None:
-            get = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
+            first = self._symmetry_loss(state, predicted[:, 0], one_hot[:, 0], target_states[:, 0], target)
+            symmetry = mask[:, 0] * first
         if rewards is not None:
             outputs = self.reward_net(predicted.flatten(0, 1)).unflatten(0, mask.shape)  # (B, M, 1 or 3)
             reward = (self._reward_loss(outputs, rewards) * mask).sum(dim=1)
-        return LatentLosses(aet, get, reward)
+        return LatentLosses(aet, symmetry, reward)
 
     def rollout(self, state: th.Tensor, one_hot: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """

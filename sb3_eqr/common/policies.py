@@ -14,19 +14,22 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
-from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.features_extractor import DEFAULT_GROUP, GroupFeaturesExtractor, ImageExtractor, find_trunk
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
-from sb3_eqr.common.layers import ConvTrunk, NoisyLinear
-from sb3_eqr.common.networks import EqRNetwork
+from sb3_eqr.common.networks.group_encoder import DEFAULT_GROUP, GroupFeaturesExtractor
+from sb3_eqr.common.networks.layers import NoisyLinear, Whitening
+from sb3_eqr.common.networks.q_networks import EqRNetwork
+from sb3_eqr.common.networks.trunks import ConvTrunk, ImageExtractor, find_trunk
 from sb3_eqr.common.type_aliases import PyTorchObs
+from sb3_eqr.common.validation import check_names, check_number
 
 Module = TypeVar("Module", bound=nn.Module)
 Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
 PROJECTIONS = ("head", "own", "none")
+OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "dueling", "noisy", "sigma_init", "latent_hidden_dim"]
+OWN_ARGUMENTS += ["projection", "state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
 
 
 class EqRPolicy(BasePolicy):
@@ -55,7 +58,7 @@ class EqRPolicy(BasePolicy):
         ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452; AdamW's own default is 0.01) reaches matrices only,
         not biases, batch-norm parameters and the noise of noisy layers
     :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
-        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``get_coef=0``
+        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``symmetry_coef=0``
     :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether the encoder's algebra parameters are whitened over the batch: states cannot collapse to a point, and
@@ -69,8 +72,9 @@ class EqRPolicy(BasePolicy):
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, whatever the state
     :param act_with_target: choose actions by the target network, which is steadier with ``tau`` < 1 (as SR-SPR,
         https://openreview.net/forum?id=OpC-9aBBVJe, and BBF do); else by the online network
-    :param reward_loss: set by the algorithm, see there
-    :param aet_loss: set by the algorithm, see there
+    :param reward_loss: "mse" (Eq. 17), or "categorical": cross-entropy over the sign of the reward
+    :param aet_loss: "distance" (Eq. 18), or "contrastive": InfoNCE among the batch's targets
+        (:func:`~sb3_eqr.common.losses.contrastive_loss`), which cannot collapse
     :param stock_kwargs: what else the stock policy takes
     :raises ValueError: for an argument out of its range
     """
@@ -82,6 +86,7 @@ class EqRPolicy(BasePolicy):
     latent_model_target: LatentModel
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
+    target_is_copy: bool  # whether the target copy equals the online networks now; a gradient step ends it
 
     def __init__(
         self,
@@ -110,14 +115,11 @@ class EqRPolicy(BasePolicy):
         aet_loss: str = "distance",
         **stock_kwargs: Any,
     ):
-        legal = inspect.signature(super().__init__).parameters
-        unknown = [name for name in stock_kwargs if name not in legal]
-        if unknown:
+        stock = inspect.signature(super().__init__).parameters
+        if any(name not in stock for name in stock_kwargs):
             own = [inspect.signature(kind.__init__).parameters for kind in (type(self), EqRPolicy)]  # type: ignore[misc]
-            names = sorted({name for parameters in own for name in list(parameters)[4:]} - {"kwargs", "stock_kwargs"})
-            raise TypeError(
-                f"policy_kwargs: {type(self).__name__} takes no {', '.join(unknown)}. It takes {', '.join(names)}."
-            )
+            names = {name for parameters in own for name in list(parameters)[4:]} - {"kwargs", "stock_kwargs"}
+            check_names(f"policy_kwargs: {type(self).__name__}", stock_kwargs, sorted(names))
         check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
         check_number("sigma_init", sigma_init, 0)
         if whiten and group is None:
@@ -225,12 +227,50 @@ class EqRPolicy(BasePolicy):
         for module in self.modules():
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
+        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
+        self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder.modules())
+        self.target_is_copy = True
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.add_param_group({"params": parameters})
         _decay_matrices_only(self)
 
+    @property
+    def description(self) -> dict[str, str]:
+        """
+        :return: what the shapes of parameters do not say, by name, in words that stand in a model's file
+        """
+        encoder = self.online.features_extractor
+        return {"group": encoder.description if isinstance(encoder, GroupFeaturesExtractor) else "no group"}
+
+    @property
+    def target_encodes_as_online(self) -> bool:
+        """Whether target features are online features, so that one pass serves for both."""
+        return self.target_is_copy and self._encoder_ignores_mode
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """As PyTorch's, with the same parameters."""
+        self.target_is_copy = False  # nothing is known of them
+        return super().load_state_dict(*args, **kwargs)
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
         return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)
+
+    def check_losses(self, aet: bool, symmetry: bool) -> None:
+        """
+        :param aet: whether the AET loss is asked for
+        :param symmetry: whether the GET loss is asked for
+        :raises ValueError: if this policy cannot serve one of them
+        """
+        if symmetry and not self.latent_model.group.has_inverse:
+            raise ValueError(
+                f"symmetry_coef: the GET loss needs a group with inverses, found group={self.group!r}. "
+                "Pass symmetry_coef=0 or another group."
+            )
+        if aet and self.projection == "head" and not self.online.net_arch:
+            raise ValueError(
+                "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
+                'Pass policy_kwargs={"net_arch": [256]} or {"projection": "own"}, or aet_coef=0.'
+            )
 
     @property
     def project(self) -> Projection:
@@ -254,6 +294,7 @@ class EqRPolicy(BasePolicy):
         :param tau: in [0, 1]; 1 copies
         """
         online, target, online_statistics, target_statistics = self._target_tensors
+        self.target_is_copy = tau == 1
         with th.no_grad():
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
@@ -336,23 +377,7 @@ class EqRPolicy(BasePolicy):
         self._frozen = modules
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            group=self.group,
-            n_blocks=self.n_blocks,
-            parameterization=self.parameterization,
-            whiten=self.whiten,
-            latent_hidden_dim=self.latent_hidden_dim,
-            dueling=self.dueling,
-            noisy=self.noisy,
-            sigma_init=self.sigma_init,
-            projection=self.projection,
-            state_dependent_actions=self.state_dependent_actions,
-            act_with_target=self.act_with_target,
-            reward_loss=self.reward_loss,
-            aet_loss=self.aet_loss,
-        )
-        return data
+        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in OWN_ARGUMENTS}}
 
 
 def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:

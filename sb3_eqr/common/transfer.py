@@ -10,7 +10,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.safe_files import is_whole_model
+from sb3_eqr.common.save_util import find_file, is_whole_model, read_description
+from sb3_eqr.common.validation import check_same_parameters
 
 ENCODER = "features_extractor"
 LATENT_PARTS = ("transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
@@ -25,10 +26,11 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
     :raises ValueError: if the file holds no EqR agent, or one of another group, trunk or number of actions
     """
     found = _saved_parts(path, policy.device)
+    check_same_parameters({"group": policy.description["group"]}, read_description(path))
     modules = representation(policy)
     for name, module in modules.items():
-        expected = {key: _kind(value) for key, value in module.state_dict().items()}
-        given = {key: _kind(value) for key, value in found[name].items()}
+        expected = {key: f"of shape {tuple(value.shape)}" for key, value in module.state_dict().items()}
+        given = {key: f"of shape {tuple(value.shape)}" for key, value in found[name].items()}
         for key in sorted(expected.keys() | given.keys()):
             if expected.get(key) != given.get(key):
                 raise ValueError(
@@ -59,7 +61,7 @@ def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device
     :return: the parameters of each part of the representation in a file
     """
     if isinstance(path, (str, pathlib.Path)):
-        found_file = next((file for file in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if file.is_file()), None)
+        found_file = find_file(path)
         if found_file is not None and not is_whole_model(found_file):
             raise ValueError(
                 f"load_representation: expected a whole file of an agent's save, found one that is cut off: {path}."
@@ -74,8 +76,3 @@ def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device
         if match and (match[1] or ENCODER) in found:
             found[match[1] or ENCODER][match[2]] = value
     return found
-
-
-def _kind(value: th.Tensor) -> str:
-    """The shape of parameters; the name of the group, which the encoder keeps as text."""
-    return bytes(value.tolist()).decode() if value.dtype == th.uint8 else f"of shape {tuple(value.shape)}"

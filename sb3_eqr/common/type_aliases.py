@@ -33,5 +33,5 @@ class LatentLosses(NamedTuple):
     """The three auxiliary losses, one number per sample. ``None``: that loss is off."""
 
     aet: th.Tensor | None  # (B,): action-equivariant transition, Eq. 18
-    get: th.Tensor | None  # (B,): group-equivariant transition, Eq. 19
+    symmetry: th.Tensor | None  # (B,): group-equivariant transition (GET), Eq. 19
     reward: th.Tensor | None  # (B,): reward prediction, Eq. 18

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.validation import check_number
 
 
 class BlindCliffwalk(gym.Env):

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.checks import check_number
+from sb3_eqr.common.validation import check_number
 
 SMALLEST_PICTURE = 36  # of what the default convolutions of CnnPolicy accept
 ENLARGED = 4  # how many pixels of a rendered picture one of an observation becomes

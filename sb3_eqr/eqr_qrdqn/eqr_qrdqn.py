@@ -1,11 +1,9 @@
 from typing import ClassVar
 
-import torch as th
 from sb3_contrib.qrdqn import QRDQN
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.losses import quantile_huber_loss
 from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, EqRQuantileNetwork, MlpPolicy, MultiInputPolicy
 
 
@@ -15,7 +13,7 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
     the quantile head is of https://arxiv.org/abs/1710.10044.
 
-    The parameters are those of :class:`~sb3_eqr.common.eqr_arguments.EqRArguments` (``help(EqRQRDQN.__init__)``), with
+    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRQRDQN.__init__)``), with
     the values of the paper for Atari 100K (Table 5) as defaults. They deviate where QR-DQN does: 51 quantiles stand in
     for 51 atoms on [-10, 10], and the priority of a sample is its quantile loss.
 
@@ -32,9 +30,3 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     quantile_net: EqRQuantileNetwork
     quantile_net_target: EqRQuantileNetwork
     target_update_interval: int | None  # type: ignore[assignment]
-
-    def _td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        loss = quantile_huber_loss(current, rewards + discounts * following)
-        return loss, loss.detach()

@@ -8,14 +8,15 @@ from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.features_extractor import ConvExtractor
-from sb3_eqr.common.networks import EqRNetwork
+from sb3_eqr.common.losses import quantile_huber_loss
+from sb3_eqr.common.networks.q_networks import EqRNetwork
+from sb3_eqr.common.networks.trunks import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.validation import check_number
 
 
 class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
-    """Features extractor and quantile head. For the parameters see :class:`~sb3_eqr.common.networks.EqRNetwork`."""
+    """Features extractor and quantile head. For the parameters see :class:`~sb3_eqr.common.networks.q_networks.EqRNetwork`."""
 
     def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
         """
@@ -32,6 +33,13 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
 
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         return outputs.mean(dim=1)
+
+    def td_loss(
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """The quantile Huber loss; it is also the priority."""
+        loss = quantile_huber_loss(current, rewards + discounts * following)
+        return loss, loss.detach()
 
 
 class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):

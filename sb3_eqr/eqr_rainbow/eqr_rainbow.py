@@ -3,13 +3,11 @@ from itertools import accumulate
 from typing import Any, ClassVar
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.dqn import DQN
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.losses import categorical_loss, categorical_projection
 from sb3_eqr.eqr_rainbow.policies import CnnPolicy, EqRCategoricalNetwork, EqRRainbowPolicy, MlpPolicy, MultiInputPolicy
 
 
@@ -20,7 +18,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     the categorical head (C51) is of https://arxiv.org/abs/1707.06887, its combination with double Q, dueling, noisy
     layers, prioritised replay and n-step returns of https://arxiv.org/abs/1710.02298.
 
-    The parameters are those of :class:`~sb3_eqr.common.eqr_arguments.EqRArguments` (``help(EqRRainbow.__init__)``), with
+    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRRainbow.__init__)``), with
     the values of the paper for Atari 100K (Table 5) as defaults.
 
     The support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), group, number of blocks, dueling and noisy
@@ -81,15 +79,6 @@ class EqRRainbow(EqRAlgorithm, DQN):
                 "Pass policy_kwargs=dict(v_min=..., v_max=...): a step's least and largest reward over 1 - gamma hold "
                 "them all. Or scale the rewards (VecNormalize)."
             )
-
-    def _td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        network = self.policy.target
-        with th.no_grad():
-            values = rewards + discounts * network.support  # (B, N)
-            target = categorical_projection(values, following.softmax(dim=1), network.v_min, network.v_max)
-        return categorical_loss(current, target)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_episode_rewards", "_warned_of_returns"]

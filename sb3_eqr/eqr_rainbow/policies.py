@@ -9,10 +9,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
-from sb3_eqr.common.checks import check_number
-from sb3_eqr.common.features_extractor import ConvExtractor
-from sb3_eqr.common.networks import EqRNetwork
+from sb3_eqr.common.losses import categorical_loss, categorical_projection
+from sb3_eqr.common.networks.q_networks import EqRNetwork
+from sb3_eqr.common.networks.trunks import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.validation import check_number
 
 
 class EqRCategoricalNetwork(EqRNetwork, QNetwork):
@@ -21,7 +22,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
 
     :param v_min: the lowest return
     :param v_max: the highest return
-    :param kwargs: the parameters of :class:`~sb3_eqr.common.networks.EqRNetwork`
+    :param kwargs: the parameters of :class:`~sb3_eqr.common.networks.q_networks.EqRNetwork`
     """
 
     support: th.Tensor  # (N,)
@@ -52,19 +53,17 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         support = self.support.view(-1, *[1] * (outputs.ndim - 2))  # (N, 1) or (N,)
         return (outputs.softmax(dim=1) * support).sum(dim=1)
 
+    def td_loss(
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """The cross-entropy with the projected target distribution; the priority is their KL divergence."""
+        with th.no_grad():
+            values = rewards + discounts * self.support  # (B, N)
+            target = categorical_projection(values, following.softmax(dim=1), self.v_min, self.v_max)
+        return categorical_loss(current, target)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "v_min": self.v_min, "v_max": self.v_max}
-
-    # The support travels with the parameters: logits say nothing without it.
-    def get_extra_state(self) -> th.Tensor:
-        return th.tensor([self.v_min, self.v_max], dtype=th.float64)
-
-    def set_extra_state(self, state: th.Tensor) -> None:
-        if state.tolist() != [self.v_min, self.v_max]:
-            raise ValueError(
-                f"return distribution: expected parameters for [v_min, v_max] = {[self.v_min, self.v_max]}, found parameters "
-                f"for {state.tolist()}. Build the model with v_min and v_max of the file, or use load(), which does."
-            )
 
 
 class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
@@ -113,6 +112,10 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     @property
     def target(self) -> EqRCategoricalNetwork:
         return self.q_net_target
+
+    @property
+    def description(self) -> dict[str, str]:
+        return {**super().description, "support": f"[{float(self.v_min)}, {float(self.v_max)}]"}  # of the logits
 
     def make_q_net(self) -> EqRCategoricalNetwork:
         return self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)

@@ -6,8 +6,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
 
-from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.latents import check_agent, encode, replayed
@@ -69,7 +69,7 @@ class LatentCallback(BaseCallback):
             if not self._has_warned:
                 warnings.warn(
                     "LatentCallback: expected an agent whose latent model is trained, found prediction_depth=0 or all of "
-                    "aet_coef, get_coef and reward_coef 0: there is nothing to look at. Leave the callback out."
+                    "aet_coef, symmetry_coef and reward_coef 0: there is nothing to look at. Leave the callback out."
                 )
             self._has_warned = True
             return

@@ -89,7 +89,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
         rewards=measures.reward_error(data.predicted_rewards, data.rewards.sign() if signed else data.rewards, data.mask),
         verdict=find_verdict(loss),
         rewards_trained=model.depth > 0 and model.reward_coef > 0,
-        symmetry_trained=model.depth > 0 and model.get_coef > 0,
+        symmetry_trained=model.depth > 0 and model.symmetry_coef > 0,
     )
 
 

@@ -11,12 +11,12 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
-from sb3_eqr.common.buffers import SequenceReplayBuffer
-from sb3_eqr.common.checks import check_number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, MatrixLieGroup, NoGroup, ProductGroup, T
-from sb3_eqr.common.safe_files import get_rng_state, set_rng_state
+from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
+from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
+from sb3_eqr.common.validation import check_number
 
 CHUNK = 256  # observations encoded at once
 # What an environment tells of its true state, under these keys of ``info``; the worlds of sb3_eqr.envs do.

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 import sb3_eqr.envs
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.safe_files import is_whole_model
+from sb3_eqr.common.save_util import is_whole_model
 from sb3_eqr.visualize.latents import FACTOR_KEYS
 
 ALGORITHMS: dict[str, type[EqRAlgorithm]] = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}

@@ -51,7 +51,7 @@ def make_sampler(categorical: bool, kept: dict[str, Any]) -> Callable[..., dict[
             "n_steps": trial.suggest_int("n_steps", 1, 8),
             "prediction_depth": trial.suggest_int("prediction_depth", 1, 5),
             "aet_coef": trial.suggest_categorical("aet_coef", [0.0, 0.1, 0.3, 1.0]),
-            "get_coef": trial.suggest_categorical("get_coef", [0.0, 0.1, 0.3, 1.0]),
+            "symmetry_coef": trial.suggest_categorical("symmetry_coef", [0.0, 0.1, 0.3, 1.0]),
             "reward_coef": trial.suggest_categorical("reward_coef", [0.0, 0.1, 0.3, 1.0]),
             "target_update_interval": trial.suggest_int("target_update_interval", 100, 2_000, log=True),
             "exploration_fraction": trial.suggest_float("exploration_fraction", 0.05, 0.3),

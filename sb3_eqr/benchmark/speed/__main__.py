@@ -17,7 +17,7 @@ from sb3_eqr.benchmark.speed.play import measure_collection, measure_evaluation
 from sb3_eqr.benchmark.speed.replay_sizes import STORED, n_envs_sweep, stored_sweep
 from sb3_eqr.benchmark.speed.steps import measure_stages, measure_steps
 from sb3_eqr.benchmark.speed.tables import Sweep, Table
-from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.common.save_util import atomic_write
 
 PROGRAM = "python -m sb3_eqr.benchmark.speed"
 SIZES = "sizes"

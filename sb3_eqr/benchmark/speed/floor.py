@@ -72,7 +72,7 @@ class Floor:
         encoder = model.policy.online.features_extractor
         self.convolutions = find_convolutions(getattr(encoder, "trunk", encoder), model.observation_space.shape or ())
         self.n_trained = model.batch_size
-        self.n_forward = model.batch_size * (1 + (model.depth if model._uses_aet else 0))
+        self.n_forward = model.batch_size * (1 + (model.depth if model.aet_coef > 0 else 0))
         self._work = [self._work_of(convolution, model.device) for convolution in self.convolutions]
 
     def _work_of(self, convolution: Convolution, device: th.device) -> Work:

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sb3_eqr.benchmark.figures import GREY, INK, looks, settings, to_png
 from sb3_eqr.benchmark.speed.tables import Sweep
-from sb3_eqr.common.safe_files import atomic_write
+from sb3_eqr.common.save_util import atomic_write
 
 PANEL = (3.6, 2.9)  # inches
 COLUMNS = 3

@@ -76,10 +76,10 @@ def update_stages(model: EqRAlgorithm) -> list[Stage]:
     policy = model.policy
     return [
         Stage("sampling", model.replay_buffer, "sample"),
-        Stage("augmentation", type(model._augment), "__call__"),
+        Stage("augmentation", type(model.objective.augment), "__call__"),
         Stage("encoder, no gradient", policy.target.features_extractor, "forward"),
         Stage("encoder, gradient", policy.online.features_extractor, "forward"),
-        Stage("TD loss", model, "_q_learning"),
+        Stage("TD loss", model.objective, "_td_terms"),
         Stage("latent losses", policy.latent_model, "forward"),
         Stage("backward", th.Tensor, "backward"),
         Stage("clipping", th.nn.utils, "clip_grad_norm_"),

@@ -1,6 +1,7 @@
 """Saving that never leaves half a file and keeps the random generators, for any off-policy algorithm."""
 
 import io
+import json
 import os
 import pathlib
 import pickle
@@ -54,6 +55,31 @@ def is_whole_model(path: pathlib.Path) -> bool:
             return {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
     except zipfile.BadZipFile:
         return False
+
+
+def read_description(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, str]:
+    """
+    What the parameters in a model's file are of, which their shapes do not say. Nothing in the file is executed for it.
+
+    :param path: of a file, its ending may be left out, or a file-like, which is left where it was
+    :return: ``EqRPolicy.description`` of the model that was saved; empty for a file of another algorithm
+    """
+    place = path if isinstance(path, (str, pathlib.Path)) else path.tell()
+    found = find_file(path) if isinstance(path, (str, pathlib.Path)) else path
+    if found is None or not zipfile.is_zipfile(found):
+        return {}  # SB3 says what is wrong
+    with zipfile.ZipFile(found) as archive:  # type: ignore[arg-type]
+        description = json.loads(archive.read("data")).get("policy_description", {})
+    if not isinstance(path, (str, pathlib.Path)):
+        path.seek(place)  # type: ignore[arg-type]
+    return description
+
+
+def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
+    """
+    :param path: of a model's file, its ending may be left out
+    """
+    return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
@@ -130,7 +156,7 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is cut off, or was saved by another class
         """
         if isinstance(path, (str, pathlib.Path)):
-            found = next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
+            found = find_file(path)
             if found is not None and not is_whole_model(found):
                 raise ValueError(
                     f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or something else. "

@@ -1,93 +1,17 @@
-"""
-Matrix Lie groups: what states and actions are made of (EqR, §3.1, §4 and appendix A).
+"""The groups of Table 1, and those given by generators of their algebra (EqR, §3.1 and appendix A)."""
 
-A network predicts ``num_params`` numbers per block; :meth:`Group.element` turns them into a group element.
-Every method is stateless, differentiable and batched over all leading dimensions.
-"""
-
-import re
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
-from math import prod
 
 import torch as th
 
-from sb3_eqr.common.rotations import ROTATIONS
+from sb3_eqr.common.groups.base import Group
+from sb3_eqr.common.groups.rotations import ROTATIONS
 
 # An inverse is replaced by its damped form where the condition number exceeds the inverse of this many
 # machine epsilons: beyond it, a plain solve has no correct digit left.
 _SINGULAR_EPS = 10.0
-
-
-class Group(ABC):
-    """
-    A group whose elements are arrays of one shape.
-
-    ``num_params``: how many numbers the network predicts per element.
-    ``element_shape``: the shape of one element.
-    ``has_inverse``: False only where the "group" is none (see :class:`NoGroup`).
-    ``needs_host``: True where an element needs a number on the host, as PyTorch's matrix exponential does on a GPU.
-    """
-
-    num_params: int
-    element_shape: tuple[int, ...]
-    has_inverse: bool = True
-    needs_host: bool = False
-
-    def __init__(self, name: str, num_params: int, element_shape: tuple[int, ...]):
-        self.name = name
-        self.num_params = num_params
-        self.element_shape = element_shape
-
-    def __repr__(self) -> str:
-        return self.name
-
-    @abstractmethod
-    def element(self, params: th.Tensor) -> th.Tensor:
-        """
-        :param params: real numbers, (..., num_params), floating point
-        :return: group elements, (..., \\*element_shape), same dtype and device
-        """
-
-    @abstractmethod
-    def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
-        """
-        The group's operation; the left factor acts on the right one (Eq. 10).
-
-        :param left: (..., \\*element_shape)
-        :param right: (..., \\*element_shape), broadcast against ``left``
-        :return: (..., \\*element_shape)
-        """
-
-    @abstractmethod
-    def inverse(self, element: th.Tensor) -> th.Tensor:
-        """
-        :param element: (..., \\*element_shape)
-        :return: (..., \\*element_shape); finite also where a GL element is singular
-        """
-
-    @abstractmethod
-    def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
-        """
-        :param batch: leading dimensions
-        :return: (\\*batch, \\*element_shape)
-        """
-
-    @property
-    def for_actions(self) -> "Group":
-        """
-        The same group with the parameters that actions are predicted in: small numbers are small moves there. States have
-        to cover the whole group, which "gram-schmidt" does without a seam; an action only has to leave the identity.
-        """
-        return self
-
-    def identity_params(self) -> th.Tensor:
-        """
-        :return: parameters of the identity, (num_params,)
-        """
-        return th.zeros(self.num_params)
 
 
 class MatrixGroup(Group):
@@ -148,7 +72,6 @@ class SO(MatrixGroup):
         count, self.rotation = ROTATIONS[parameterization]
         super().__init__(f"SO({n})", count(n), (n, n))
         self.parameterization = parameterization
-        self.needs_host = parameterization == "exp"
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return self.rotation(params, self.element_shape[-1])
@@ -169,7 +92,6 @@ class SE(MatrixGroup):
         super().__init__(f"SE({n})", count(n) + n, (n + 1, n + 1))
         self.n = n
         self.parameterization = parameterization
-        self.needs_host = parameterization == "exp"
 
     def element(self, params: th.Tensor) -> th.Tensor:
         angles, translation = params.split([self.num_params - self.n, self.n], dim=-1)
@@ -231,7 +153,7 @@ class NoGroup(Group):
         return left.expand(th.broadcast_shapes(left.shape, right.shape))
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
-        raise ValueError('group "none" has no inverse, so it cannot serve the GET loss: set get_coef=0 or choose a group')
+        raise ValueError('group "none" has no inverse, so it cannot serve the GET loss: set symmetry_coef=0 or choose a group')
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         raise ValueError('group "none" has no identity: choose a group such as "SE(2)"')
@@ -247,8 +169,6 @@ class MatrixLieGroup(MatrixGroup):
     :param generators: the basis E⁽ⁱ⁾, (D, m, m), anything ``torch.as_tensor`` takes; finite, D ≥ 1, m ≥ 1
     :raises ValueError: if the shape is another, an entry is not finite, or they depend on each other
     """
-
-    needs_host = True
 
     def __init__(self, generators: th.Tensor | Sequence):
         basis = th.as_tensor(generators, dtype=th.float64)
@@ -276,99 +196,3 @@ class MatrixLieGroup(MatrixGroup):
         if place not in self._placed:  # copied once per device, not once per step
             self._placed[place] = self.generators.to(dtype=params.dtype, device=params.device)
         return th.matrix_exp(th.einsum("...d,dij->...ij", params, self._placed[place]))
-
-
-class ProductGroup(Group):
-    """
-    Different groups side by side, as one flat vector: the first factor's blocks, then the second's, and so on.
-
-    :param factors: pairs of a group and how many blocks of it
-    """
-
-    def __init__(self, factors: Sequence[tuple[Group, int]]):
-        self.factors = list(factors)
-        self.has_inverse = all(group.has_inverse for group, _ in self.factors)
-        self.needs_host = any(group.needs_host for group, _ in self.factors)
-        self._sizes = [count * prod(group.element_shape) for group, count in self.factors]
-        name = " x ".join(f"{group}^{count}" if count > 1 else f"{group}" for group, count in self.factors)
-        super().__init__(name, sum(group.num_params * count for group, count in self.factors), (sum(self._sizes),))
-
-    def element(self, params: th.Tensor) -> th.Tensor:
-        pieces = params.split([group.num_params * count for group, count in self.factors], dim=-1)
-        return self._flatten(
-            group.element(piece.unflatten(-1, (count, group.num_params)))
-            for (group, count), piece in zip(self.factors, pieces, strict=True)
-        )
-
-    def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
-        pairs = zip(self.factors, self._unflatten(left), self._unflatten(right), strict=True)
-        return self._flatten(group.compose(a, b) for (group, _), a, b in pairs)
-
-    def inverse(self, element: th.Tensor) -> th.Tensor:
-        pieces = zip(self.factors, self._unflatten(element), strict=True)
-        return self._flatten(group.inverse(piece) for (group, _), piece in pieces)
-
-    def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
-        return self._flatten(group.identity(*batch, n, dtype=dtype, device=device) for group, n in self.factors)
-
-    def identity_params(self) -> th.Tensor:
-        return th.cat([group.identity_params().repeat(count) for group, count in self.factors])
-
-    @property
-    def for_actions(self) -> Group:
-        return ProductGroup([(group.for_actions, count) for group, count in self.factors])
-
-    def _unflatten(self, element: th.Tensor) -> list[th.Tensor]:
-        pieces = element.split(self._sizes, dim=-1)
-        return [
-            piece.unflatten(-1, (count, *group.element_shape))
-            for (group, count), piece in zip(self.factors, pieces, strict=True)
-        ]
-
-    def _flatten(self, pieces) -> th.Tensor:
-        groups = [group for group, _ in self.factors]
-        return th.cat([piece.flatten(-1 - len(g.element_shape)) for g, piece in zip(groups, pieces, strict=True)], dim=-1)
-
-
-_FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")
-_LEGAL = "GL(n), SE(n), T(n) with n >= 1, SO(n) with n >= 2, none or none(n), or a product such as 'SE(2)^8 x SO(3)^4'"
-NO_GROUP_SIZE = 512  # the width of SB3's NatureCNN, for "none" without a size
-
-
-def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
-    """
-    The one table from names to groups.
-
-    :param group: "GL(n)", "SE(n)", "SO(n)", "T(n)", "none", a product such as "SE(2)^8 x SO(3)^4";
-        a :class:`Group` is returned as it is
-    :param parameterization: of rotations, in SO and SE: "euler" (product over planes, the default of the paper's
-        experiments), "exp" (matrix exponential) or "gram-schmidt" (orthonormalised columns, which have no seam)
-    :raises ValueError: for a name or size that is not legal; the message lists the legal ones
-    """
-    if isinstance(group, Group):
-        return group
-    if not isinstance(group, str):
-        raise ValueError(f"group: expected {_LEGAL}; found {group!r}")
-    if parameterization not in ROTATIONS:
-        raise ValueError(f"parameterization: expected one of {list(ROTATIONS)}, found {parameterization!r}")
-    factors = [_make_factor(part, group, parameterization) for part in re.split(r"[x×]", group.replace(" ", ""))]
-    if len(factors) == 1 and factors[0][1] is None:
-        return factors[0][0]
-    return ProductGroup([(factor, count or 1) for factor, count in factors])
-
-
-def _make_factor(part: str, name: str, parameterization: str) -> tuple[Group, int | None]:
-    match = _FACTOR.fullmatch(part)
-    if match is None or (match[2] is None and match[1] != "none"):
-        raise ValueError(f"group: expected {_LEGAL}; found {name!r}")
-    kind, n, count = match[1], int(match[2] or NO_GROUP_SIZE), int(match[3]) if match[3] else None
-    if n < (2 if kind == "SO" else 1) or count == 0:
-        raise ValueError(f"group: expected {_LEGAL}; found {name!r}, whose n or number of blocks is too small")
-    makers: dict[str, Callable[[], Group]] = {
-        "GL": lambda: GL(n),
-        "SE": lambda: SE(n, parameterization),
-        "SO": lambda: SO(n, parameterization),
-        "T": lambda: T(n),
-        "none": lambda: NoGroup(n),
-    }
-    return makers[kind](), count

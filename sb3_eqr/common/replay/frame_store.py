@@ -33,7 +33,6 @@ class FrameStore:
         self._allocate_arrays(1 + n_transitions + n_transitions // 64 + n_envs * (n_stack + 1), np.dtype(dtype))
         self._n_used = 1  # slots below this have been handed out at some time
         self._n_free = 0  # of these, the ones given back: the first entries of _free
-        self._log: list[np.ndarray] | None = None  # of written slots, where someone reads it
 
     def _allocate_arrays(self, capacity: int, dtype: np.dtype) -> None:
         self._frames = np.zeros((capacity, *self._frame_shape), dtype=dtype)
@@ -50,23 +49,6 @@ class FrameStore:
     def nbytes(self) -> int:
         """Memory, in bytes."""
         return self._frames.nbytes + self._references.nbytes + self._free.nbytes + self._ids.nbytes
-
-    @property
-    def frames(self) -> np.ndarray:
-        """All slots, (capacity, *frame_shape)."""
-        return self._frames
-
-    def start_log(self) -> None:
-        """Keep a list of written slots from now on, for :meth:`read_log`."""
-        self._log = []
-
-    def read_log(self) -> np.ndarray:
-        """
-        :return: slots written since the last call, each once, (N,), int64
-        """
-        slots = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(self._log or [])]))
-        self._log = []
-        return slots
 
     def add(self, position: int, obs: np.ndarray, next_obs: np.ndarray, overwrite: bool) -> np.ndarray:
         """
@@ -101,23 +83,14 @@ class FrameStore:
         self._ids[position] = ids
         return continues
 
-    def ids(self, positions: np.ndarray, envs: np.ndarray) -> np.ndarray:
+    def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> np.ndarray:
         """
-        :param positions: (...)
+        :param positions: of pairs, (...)
         :param envs: (...), broadcast against ``positions``
-        :return: the frames of these observations, (..., n_stack), int32
+        :param following: the next observations, not the observations
+        :return: (..., *obs_shape), a copy
         """
-        return self._ids[positions, envs, :-1]
-
-    def next_ids(self, positions: np.ndarray, envs: np.ndarray) -> np.ndarray:
-        """As :meth:`ids`, for the observation after."""
-        return self._ids[positions, envs, 1:]
-
-    def observations(self, ids: np.ndarray) -> np.ndarray:
-        """
-        :param ids: (..., n_stack)
-        :return: observations, (..., *obs_shape), a copy
-        """
+        ids = self._ids[positions, envs, 1:] if following else self._ids[positions, envs, :-1]  # (..., n_stack)
         return self._frames[ids].reshape(*ids.shape[:-1], *self.obs_shape)
 
     def _as_stacks(self, obs: np.ndarray) -> np.ndarray:
@@ -143,10 +116,7 @@ class FrameStore:
         self._n_used += count - reused
         if self._n_used > len(self._frames):
             self._grow()
-        taken = np.concatenate([slots, fresh])
-        if self._log is not None:
-            self._log.append(taken)
-        return taken
+        return np.concatenate([slots, fresh])
 
     def _grow(self) -> None:
         capacity = self._n_used + len(self._frames) // 16
@@ -164,7 +134,6 @@ class FrameStore:
         """Only slots in use are saved, so that a buffer filled to a tenth makes a file of a tenth."""
         state = self.__dict__.copy()
         state["_capacity"] = len(self._frames)
-        state.pop("_log")
         for name in ("_frames", "_references", "_free"):
             state[name] = state[name][: self._n_used]
         return state
@@ -172,7 +141,7 @@ class FrameStore:
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved = {name: state.pop(name) for name in ("_frames", "_references", "_free")}
         capacity = state.pop("_capacity")
-        self.__dict__.update(state, _log=None)
+        self.__dict__.update(state)
         self._allocate_arrays(capacity, saved["_frames"].dtype)
         for name, array in saved.items():
             getattr(self, name)[: len(array)] = array

@@ -39,15 +39,6 @@ class SumTree:
         """
         return self._leaves.ravel()[leaves]
 
-    def find(self, masses: np.ndarray) -> np.ndarray:
-        """
-        The leaf at which the running sum of priorities first exceeds each mass. A leaf of priority 0 is never found.
-
-        :param masses: numbers from 0 to below the sum of all priorities, (B,)
-        :return: leaves, (B,), int64
-        """
-        return self._find(masses, self._running_sum())
-
     def sample(self, batch_size: int, uniforms: np.ndarray) -> np.ndarray:
         """
         Stratified draws (Schaul et al. 2016, appendix B.2.1, https://arxiv.org/abs/1511.05952):
@@ -56,15 +47,9 @@ class SumTree:
         :param uniforms: random numbers in [0, 1), (B,)
         :return: leaves, (B,), int64
         """
-        starts = self._running_sum()
-        return self._find((np.arange(batch_size) + uniforms) * (starts[-1] / batch_size), starts)
-
-    def _running_sum(self) -> np.ndarray:
         starts = np.zeros(len(self._sums) + 1)
         self._sums.cumsum(out=starts[1:])
-        return starts
-
-    def _find(self, masses: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        masses = (np.arange(batch_size) + uniforms) * (starts[-1] / batch_size)
         # Rounding may leave a mass just above what is there: never look behind the last priority above 0.
         masses = np.minimum(masses, np.nextafter(starts[-1], 0))
         blocks = starts.searchsorted(masses, side="right") - 1  # (B,)

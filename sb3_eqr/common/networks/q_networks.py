@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_eqr.common.layers import DistributionalHead
+from sb3_eqr.common.networks.layers import DistributionalHead
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 
@@ -81,6 +81,20 @@ class EqRNetwork(BasePolicy):
         """
         :param outputs: of the head, (B, N, A), or those of one action, (B, N)
         :return: Q values, (B, A), or (B,)
+        """
+
+    @abstractmethod
+    def td_loss(
+        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The head's own loss.
+
+        :param current: outputs of the online head for (s_t, a_t), (B, N)
+        :param following: those of the target head after the n-step transition, for the best action, no gradient, (B, N)
+        :param rewards: the n-step return, (B, 1)
+        :param discounts: 0 where the transition ended in a terminal state, γ to its length elsewhere, (B, 1)
+        :return: loss, (B,), and priorities ≥ 0 without gradient, (B,)
         """
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:

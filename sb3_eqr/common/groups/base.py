@@ -1,0 +1,72 @@
+"""What every group offers to encoder and latent model (EqR, §3.1 and §4)."""
+
+from abc import ABC, abstractmethod
+
+import torch as th
+
+
+class Group(ABC):
+    """
+    A group whose elements are arrays of one shape.
+
+    ``num_params``: how many numbers the network predicts per element.
+    ``element_shape``: the shape of one element.
+    ``has_inverse``: False only where the "group" is none (see :class:`NoGroup`).
+    """
+
+    num_params: int
+    element_shape: tuple[int, ...]
+    has_inverse: bool = True
+
+    def __init__(self, name: str, num_params: int, element_shape: tuple[int, ...]):
+        self.name = name
+        self.num_params = num_params
+        self.element_shape = element_shape
+
+    def __repr__(self) -> str:
+        return self.name
+
+    @abstractmethod
+    def element(self, params: th.Tensor) -> th.Tensor:
+        """
+        :param params: real numbers, (..., num_params), floating point
+        :return: group elements, (..., \\*element_shape), same dtype and device
+        """
+
+    @abstractmethod
+    def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
+        """
+        The group's operation; the left factor acts on the right one (Eq. 10).
+
+        :param left: (..., \\*element_shape)
+        :param right: (..., \\*element_shape), broadcast against ``left``
+        :return: (..., \\*element_shape)
+        """
+
+    @abstractmethod
+    def inverse(self, element: th.Tensor) -> th.Tensor:
+        """
+        :param element: (..., \\*element_shape)
+        :return: (..., \\*element_shape); finite also where a GL element is singular
+        """
+
+    @abstractmethod
+    def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
+        """
+        :param batch: leading dimensions
+        :return: (\\*batch, \\*element_shape)
+        """
+
+    @property
+    def for_actions(self) -> "Group":
+        """
+        The same group with the parameters that actions are predicted in: small numbers are small moves there. States have
+        to cover the whole group, which "gram-schmidt" does without a seam; an action only has to leave the identity.
+        """
+        return self
+
+    def identity_params(self) -> th.Tensor:
+        """
+        :return: parameters of the identity, (num_params,)
+        """
+        return th.zeros(self.num_params)

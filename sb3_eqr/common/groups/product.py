@@ -1,0 +1,106 @@
+"""Different groups as one, and the one table from names to groups."""
+
+import re
+from collections.abc import Callable, Sequence
+from math import prod
+
+import torch as th
+
+from sb3_eqr.common.groups.base import Group
+from sb3_eqr.common.groups.matrix import GL, SE, SO, NoGroup, T
+from sb3_eqr.common.groups.rotations import ROTATIONS
+
+
+class ProductGroup(Group):
+    """
+    Different groups side by side, as one flat vector: the first factor's blocks, then the second's, and so on.
+
+    :param factors: pairs of a group and how many blocks of it
+    """
+
+    def __init__(self, factors: Sequence[tuple[Group, int]]):
+        self.factors = list(factors)
+        self.has_inverse = all(group.has_inverse for group, _ in self.factors)
+        self._sizes = [count * prod(group.element_shape) for group, count in self.factors]
+        name = " x ".join(f"{group}^{count}" if count > 1 else f"{group}" for group, count in self.factors)
+        super().__init__(name, sum(group.num_params * count for group, count in self.factors), (sum(self._sizes),))
+
+    def element(self, params: th.Tensor) -> th.Tensor:
+        pieces = params.split([group.num_params * count for group, count in self.factors], dim=-1)
+        return self._flatten(
+            group.element(piece.unflatten(-1, (count, group.num_params)))
+            for (group, count), piece in zip(self.factors, pieces, strict=True)
+        )
+
+    def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
+        pairs = zip(self.factors, self._unflatten(left), self._unflatten(right), strict=True)
+        return self._flatten(group.compose(a, b) for (group, _), a, b in pairs)
+
+    def inverse(self, element: th.Tensor) -> th.Tensor:
+        pieces = zip(self.factors, self._unflatten(element), strict=True)
+        return self._flatten(group.inverse(piece) for (group, _), piece in pieces)
+
+    def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
+        return self._flatten(group.identity(*batch, n, dtype=dtype, device=device) for group, n in self.factors)
+
+    def identity_params(self) -> th.Tensor:
+        return th.cat([group.identity_params().repeat(count) for group, count in self.factors])
+
+    @property
+    def for_actions(self) -> Group:
+        return ProductGroup([(group.for_actions, count) for group, count in self.factors])
+
+    def _unflatten(self, element: th.Tensor) -> list[th.Tensor]:
+        pieces = element.split(self._sizes, dim=-1)
+        return [
+            piece.unflatten(-1, (count, *group.element_shape))
+            for (group, count), piece in zip(self.factors, pieces, strict=True)
+        ]
+
+    def _flatten(self, pieces) -> th.Tensor:
+        groups = [group for group, _ in self.factors]
+        return th.cat([piece.flatten(-1 - len(g.element_shape)) for g, piece in zip(groups, pieces, strict=True)], dim=-1)
+
+
+_FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")
+_LEGAL = "GL(n), SE(n), T(n) with n >= 1, SO(n) with n >= 2, none or none(n), or a product such as 'SE(2)^8 x SO(3)^4'"
+NO_GROUP_SIZE = 512  # the width of SB3's NatureCNN, for "none" without a size
+
+
+def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
+    """
+    The one table from names to groups.
+
+    :param group: "GL(n)", "SE(n)", "SO(n)", "T(n)", "none", a product such as "SE(2)^8 x SO(3)^4";
+        a :class:`Group` is returned as it is
+    :param parameterization: of rotations, in SO and SE: "euler" (product over planes, the default of the paper's
+        experiments), "exp" (matrix exponential) or "gram-schmidt" (orthonormalised columns, which have no seam)
+    :raises ValueError: for a name or size that is not legal; the message lists the legal ones
+    """
+    if isinstance(group, Group):
+        return group
+    if not isinstance(group, str):
+        raise ValueError(f"group: expected {_LEGAL}; found {group!r}")
+    if parameterization not in ROTATIONS:
+        raise ValueError(f"parameterization: expected one of {list(ROTATIONS)}, found {parameterization!r}")
+    factors = [_make_factor(part, group, parameterization) for part in re.split(r"[x×]", group.replace(" ", ""))]
+    if len(factors) == 1 and factors[0][1] is None:
+        return factors[0][0]
+    return ProductGroup([(factor, count or 1) for factor, count in factors])
+
+
+def _make_factor(part: str, name: str, parameterization: str) -> tuple[Group, int | None]:
+    match = _FACTOR.fullmatch(part)
+    if match is None or (match[2] is None and match[1] != "none"):
+        raise ValueError(f"group: expected {_LEGAL}; found {name!r}")
+    kind, n, count = match[1], int(match[2] or NO_GROUP_SIZE), int(match[3]) if match[3] else None
+    if n < (2 if kind == "SO" else 1) or count == 0:
+        raise ValueError(f"group: expected {_LEGAL}; found {name!r}, whose n or number of blocks is too small")
+    makers: dict[str, Callable[[], Group]] = {
+        "GL": lambda: GL(n),
+        "SE": lambda: SE(n, parameterization),
+        "SO": lambda: SO(n, parameterization),
+        "T": lambda: T(n),
+        "none": lambda: NoGroup(n),
+    }
+    return makers[kind](), count

@@ -1,0 +1,237 @@
+"""Convolutional trunks, and the features extractors that put them into SB3."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_eqr.common.validation import check_number
+
+NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and appendix B.4
+
+
+class ConvTrunk(nn.Sequential):
+    """
+    Convolutions with a ReLU after each, flattened, without a linear layer.
+
+    :param in_channels: C
+    :param layers: (filters, kernel size, stride) of each; the default is the network of Mnih et al. 2015 (appendix B.4)
+    """
+
+    def __init__(self, in_channels: int, layers: Sequence[Sequence[int]] = NATURE_LAYERS):
+        modules: list[nn.Module] = []
+        for filters, kernel_size, stride in layers:
+            modules += [nn.Conv2d(in_channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
+            in_channels = filters
+        super().__init__(*modules, nn.Flatten())
+
+    @staticmethod
+    def smallest_image(layers: Sequence[Sequence[int]] = NATURE_LAYERS) -> int:
+        """
+        :return: the height and width that leave one pixel after the last layer
+        """
+        size = 1
+        for _, kernel_size, stride in reversed(layers):
+            size = (size - 1) * stride + kernel_size
+        return size
+
+    def to_channels_last(self) -> None:
+        """
+        Lay the weights out as :meth:`forward` computes, so that no call has to copy them. Not done from the start: the
+        orthogonal initialisation of stock PPO takes no other layout than PyTorch's.
+        """
+        first = next(iter(self.parameters()), None)
+        if first is not None and first.shape[1] > 1:  # images of one channel have but one layout
+            self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: (B, C, H, W), floating point
+        :return: (B, features)
+        """
+        # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU.
+        return super().forward(images.contiguous(memory_format=th.channels_last))
+
+
+class ImpalaTrunk(ConvTrunk):
+    """
+    The residual network of IMPALA (Espeholt et al. 2018, Figure 3, https://arxiv.org/abs/1802.01561), flattened, without
+    a linear layer: three stages of a 3×3 convolution, a 3×3 max pooling with stride 2 and two residual blocks.
+
+    :param in_channels: C
+    :param width_scale: multiplies the 16, 32 and 32 channels of the stages; BBF uses 4
+    """
+
+    def __init__(self, in_channels: int, width_scale: float = 1):
+        modules: list[nn.Module] = []
+        for channels in (16, 32, 32):
+            width = max(round(channels * width_scale), 1)
+            modules += [nn.Conv2d(in_channels, width, 3, padding=1), nn.MaxPool2d(3, stride=2, padding=1)]
+            modules += [ResidualBlock(width), ResidualBlock(width)]
+            in_channels = width
+        nn.Sequential.__init__(self, *modules, nn.ReLU(), nn.Flatten())
+
+
+class ResidualBlock(nn.Module):
+    """
+    x + conv(ReLU(conv(ReLU(x)))), with 3×3 convolutions.
+
+    :param channels: of input and output
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: (B, C, H, W)
+        :return: the same shape
+        """
+        return images + self.conv2(F.relu(self.conv1(F.relu(images)), inplace=True))
+
+
+def rescaled(features: th.Tensor) -> th.Tensor:
+    """
+    Each sample's features shifted and scaled to [0, 1] (Schrittwieser et al. 2020,
+    https://arxiv.org/abs/1911.08265; SPR and BBF do so with their convolutions' output).
+
+    :param features: (B, D)
+    :return: (B, D)
+    """
+    low = features.amin(dim=1, keepdim=True)
+    return (features - low) / (features.amax(dim=1, keepdim=True) - low + 1e-5)
+
+
+class ImageExtractor(BaseFeaturesExtractor):
+    """
+    SB3 features extractor around a convolutional trunk.
+
+    :param observation_space: channels-first images
+    :param make_trunk: from the number of channels to the trunk
+    :param smallest: legal height and width
+    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
+    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
+    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
+    :raises ValueError: if the observations are no such images
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        make_trunk: Callable[[int], nn.Module],
+        smallest: int,
+        features_dim: int | None,
+        normalized_image: bool,
+        rescale: bool,
+    ):
+        if features_dim is not None:
+            check_number("features_dim", features_dim, 1, whole=True)
+        if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
+            raise ValueError(
+                f"image encoder: expected uint8 images (channels, height, width) in [0, 255], found {observation_space}. "
+                "Use MlpPolicy for vectors, MultiInputPolicy for dicts, both without a features_extractor_class for images, "
+                "and normalize_images=False for float images."
+            )
+        channels, height, width = observation_space.shape
+        if min(height, width) < smallest:
+            raise ValueError(
+                f"image encoder: expected images of at least {smallest}x{smallest} pixels, found {height}x{width}. "
+                "Pass a features_extractor_class with smaller filters."
+            )
+        trunk = make_trunk(channels)
+        with th.no_grad():
+            trunk_dim = trunk(th.zeros(1, channels, height, width)).shape[1]
+        super().__init__(observation_space, features_dim or trunk_dim)
+        self.trunk = trunk
+        self.rescale = rescale
+        self.linear = None if features_dim is None else nn.Sequential(nn.Linear(trunk_dim, features_dim), nn.ReLU())
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        features = self.trunk(observations)  # (B, trunk_dim)
+        features = rescaled(features) if self.rescale else features
+        return features if self.linear is None else self.linear(features)  # (B, features_dim)
+
+
+class ConvExtractor(ImageExtractor):
+    """
+    :class:`~sb3_eqr.common.networks.trunks.ConvTrunk` as SB3 features extractor: the paper's convolutions, no linear layer.
+
+    :param observation_space: channels-first images, at least 36×36 with the default layers
+    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
+    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
+    :param layers: (filters, kernel size, stride) of each convolution
+    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
+    :raises ValueError: if the observations are no such images
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int | None = None,
+        normalized_image: bool = False,
+        layers: Sequence[Sequence[int]] = NATURE_LAYERS,
+        rescale: bool = False,
+    ):
+        smallest = ConvTrunk.smallest_image(layers)
+        make_trunk = partial(ConvTrunk, layers=layers)
+        super().__init__(observation_space, make_trunk, smallest, features_dim, normalized_image, rescale)
+
+
+class ImpalaExtractor(ImageExtractor):
+    """
+    :class:`~sb3_eqr.common.networks.trunks.ImpalaTrunk` as SB3 features extractor.
+
+    :param observation_space: channels-first images
+    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
+    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
+    :param width_scale: multiplies the channels, > 0; 4 in BBF (https://arxiv.org/abs/2305.19452)
+    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
+    :raises ValueError: if the observations are no such images, or for a width of 0 or less
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int | None = None,
+        normalized_image: bool = False,
+        width_scale: float = 1,
+        rescale: bool = False,
+    ):
+        check_number("width_scale", width_scale, 1 / 16)  # one channel in the first stage
+        make_trunk = partial(ImpalaTrunk, width_scale=width_scale)
+        super().__init__(observation_space, make_trunk, 1, features_dim, normalized_image, rescale)
+
+
+# Names for files that hold plain strings only.
+TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {"nature": ConvExtractor, "impala": ImpalaExtractor}
+
+
+def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
+    """
+    :param trunk: a features extractor, or one of the names in ``TRUNKS``
+    :raises ValueError: for an unknown name
+    """
+    if not isinstance(trunk, str):
+        return trunk
+    if trunk not in TRUNKS:
+        raise ValueError(f"features_extractor_class: expected a class or one of {list(TRUNKS)}, found {trunk!r}")
+    return TRUNKS[trunk]
+
+
+def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> type[BaseFeaturesExtractor]:
+    """
+    :param observation_space: any that SB3 supports
+    :param normalized_image: whether images are floats already
+    :return: the paper's convolutions for images, SB3's extractors otherwise
+    """
+    if isinstance(observation_space, spaces.Dict):
+        return CombinedExtractor
+    is_image = is_image_space(observation_space, normalized_image=normalized_image)
+    return ConvExtractor if is_image else FlattenExtractor

@@ -1,0 +1,411 @@
+"""Replay of windows: the n-step transition and the M-step rollout that start at the same step, from one storage."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_eqr.common.replay.frame_store import FrameStore
+from sb3_eqr.common.replay.sum_tree import SumTree
+from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
+from sb3_eqr.common.validation import check_number
+
+try:
+    import psutil
+except ImportError:
+    psutil = None  # type: ignore[assignment]
+
+
+class SequenceReplayBuffer(ReplayBuffer):
+    """
+    Uniform replay of n-step transitions with M-step rollouts.
+
+    ``add`` and ``sample`` are SB3's. Every observation is stored once, and every frame of a stack once (see
+    :class:`~sb3_eqr.common.replay.frame_store.FrameStore`). Terminal observations are kept. ``n_steps``, ``gamma`` and
+    ``prediction_depth`` are read at each call of ``sample``, so a schedule may move them.
+
+    Without a rollout (M = 0) this is SB3's ``NStepReplayBuffer``, to the same draws: a return that would cross the
+    write head is cut there and bootstraps from the newest observation. With a rollout, no start is drawn whose window
+    of max(n, M) transitions would cross the write head.
+
+    :param buffer_size: number of transitions, over all environments; per environment at least n + M + 1
+    :param observation_space: any that SB3 supports
+    :param action_space: Discrete
+    :param device: where samples go
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: ignored: memory is always saved
+    :param handle_timeout_termination: whether a time-out (``TimeLimit.truncated``) is told from a terminal state
+    :param n_steps: n ≥ 1
+    :param gamma: γ in [0, 1]
+    :param prediction_depth: M ≥ 0
+    :param frame_stack: number of frames stacked along the first axis of a channels-first image; 1: stored whole
+    :raises ValueError: if one of these is out of its range
+    """
+
+    timeouts: np.ndarray
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        prediction_depth: int = 0,
+        frame_stack: int = 1,
+    ):
+        # Not ReplayBuffer.__init__: it would allocate every observation twice, and every frame of a stack eight times.
+        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        self.n_steps = n_steps
+        self.gamma = gamma
+        self.prediction_depth = prediction_depth
+        self._check_arguments(frame_stack)
+
+        is_dict = isinstance(observation_space, spaces.Dict)
+        obs_spaces = observation_space.spaces if is_dict else {"": observation_space}  # type: ignore[attr-defined]
+        obs_shapes = self.obs_shape if isinstance(self.obs_shape, dict) else {"": self.obs_shape}
+        self._stores = {
+            key: FrameStore(self.buffer_size, n_envs, obs_shapes[key], space.dtype, frame_stack)  # type: ignore[arg-type]
+            for key, space in obs_spaces.items()
+        }
+        shape = (self.buffer_size, n_envs)
+        self.actions = np.zeros((*shape, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
+        self.rewards = np.zeros(shape, dtype=np.float32)
+        self.dones = np.zeros(shape, dtype=np.float32)
+        self.timeouts = np.zeros(shape, dtype=np.float32)
+        self._episode_starts = np.ones(n_envs, dtype=bool)
+        available = np.inf if psutil is None else psutil.virtual_memory().available
+        needed = self._array_bytes()
+        if needed > available:
+            warnings.warn(
+                "This system does not have apparently enough memory to store the complete replay buffer "
+                f"{needed / 1e9:.2f}GB > {available / 1e9:.2f}GB"
+            )
+
+    def _check_arguments(self, frame_stack: int) -> None:
+        check_number("n_steps", self.n_steps, 1, whole=True)
+        check_number("prediction_depth", self.prediction_depth, 0, whole=True)
+        check_number("gamma", self.gamma, 0, 1)
+        needed = self.n_steps + self.prediction_depth + 1
+        if self.buffer_size < needed:
+            raise ValueError(
+                f"buffer_size: expected at least n_steps + prediction_depth + 1 = {needed} transitions per environment, "
+                f"found {self.buffer_size} ({self.n_envs} environments). Pass buffer_size={needed * self.n_envs} or more."
+            )
+        channels = self.obs_shape[0] if isinstance(self.observation_space, spaces.Box) and self.obs_shape else 1
+        if frame_stack < 1 or channels % frame_stack != 0:
+            raise ValueError(
+                f"frame_stack: expected a divisor of the first axis of the observations (channels first), found "
+                f"{frame_stack} for {self.observation_space}. Pass frame_stack=1 to store observations whole."
+            )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of everything stored, in bytes."""
+        return self._array_bytes()
+
+    def _array_bytes(self) -> int:
+        arrays = (self.actions, self.rewards, self.dones, self.timeouts)
+        return sum(store.nbytes for store in self._stores.values()) + sum(array.nbytes for array in arrays)
+
+    @property
+    def window(self) -> int:
+        """Number of transitions that a start needs after it, itself included."""
+        return max(self.n_steps, self.prediction_depth)
+
+    def can_sample(self) -> bool:
+        """
+        Whether there is a start to draw.
+
+        :raises ValueError: if ``n_steps`` or ``prediction_depth`` has been moved beyond what the buffer can hold
+        """
+        self._check_arguments(frame_stack=1)
+        return self.size() >= (self.window if self.prediction_depth > 0 else 1)
+
+    def add(  # type: ignore[override]
+        self,
+        obs: np.ndarray | dict[str, np.ndarray],
+        next_obs: np.ndarray | dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment.
+
+        :param obs: s_t, (n_envs, *obs_shape)
+        :param next_obs: s_{t+1}, the terminal observation where the episode ended, (n_envs, *obs_shape)
+        :param action: (n_envs,)
+        :param reward: (n_envs,)
+        :param done: whether the episode ended, by a terminal state or a time-out, (n_envs,)
+        :param infos: one dict per environment; ``TimeLimit.truncated`` marks a time-out
+        """
+        follows = np.ones(self.n_envs, dtype=bool)
+        for key, store in self._stores.items():
+            now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
+            follows &= store.add(self.pos, self._shaped(now, store), self._shaped(then, store), overwrite=self.full)
+        # An environment that was reset in the middle of an episode (a second call of learn) cuts it like a time-out.
+        self.timeouts[self.pos - 1, ~follows & ~self._episode_starts] = 1.0
+
+        self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
+        self.rewards[self.pos] = reward
+        self.dones[self.pos] = done
+        self.timeouts[self.pos] = 0.0
+        if self.handle_timeout_termination:
+            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self._episode_starts = np.array(done, dtype=bool)
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def reset(self) -> None:
+        """Forget everything."""
+        super().reset()
+        self._stores = {key: store.emptied() for key, store in self._stores.items()}
+        self._episode_starts[:] = True
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
+        """
+        :param batch_size: B
+        :param env: normalises observations and one-step rewards, where given
+        :return: B windows, drawn uniformly from NumPy's global generator (which ``set_random_seed`` seeds)
+        """
+        if self.prediction_depth == 0:  # SB3's own draws
+            positions = np.random.randint(0, self.size(), size=batch_size)
+        else:
+            positions = self._positions(np.random.randint(0, self.n_starts, size=batch_size))
+        return self._windows(positions, np.random.randint(0, self.n_envs, size=batch_size), env)
+
+    def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
+        """Uniform replay keeps none; see :class:`PrioritizedSequenceReplayBuffer`."""
+
+    @property
+    def n_starts(self) -> int:
+        """How many steps have a complete window behind them, per environment."""
+        return self.size() - self.window + 1
+
+    def windows(self, starts: np.ndarray, envs: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
+        """
+        The windows of one's own choice.
+
+        :param starts: steps, 0 is the oldest stored, below ``n_starts``, (B,)
+        :param envs: environments, (B,)
+        :param env: normalises observations and one-step rewards, where given
+        """
+        return self._windows(self._positions(starts), envs, env)
+
+    def _positions(self, starts: np.ndarray) -> np.ndarray:
+        return (starts + (self.pos if self.full else 0)) % self.buffer_size  # from the oldest on
+
+    def _windows(self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SequenceReplayBufferSamples:
+        """
+        The windows that start at ``positions`` of ``envs``.
+
+        :param positions: (B,)
+        :param envs: (B,)
+        """
+        n, depth = self.n_steps, self.prediction_depth
+        columns = envs[:, None]
+        steps = np.arange(max(n, depth))
+        window = (positions[:, None] + steps) % self.buffer_size  # (B, W)
+        # The newest transition ends a window: what lies behind the write head is the oldest data.
+        ends = (self.dones[window, columns] + self.timeouts[window, columns] > 0) | (
+            window == (self.pos - 1) % self.buffer_size
+        )
+        first_end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(steps) - 1)  # (B,)
+        rewards = self._normalize_reward(self.rewards[window, columns], env)  # (B, W)
+
+        # The n-step transition: rewards up to its end, bootstrap from the observation after.
+        last_step = np.minimum(first_end, n - 1)
+        included = steps[:n] <= last_step[:, None]  # (B, n)
+        powers = self.gamma ** np.arange(n, dtype=np.float32)
+        returns = (rewards[:, :n] * powers * included).sum(axis=1, keepdims=True)  # (B, 1)
+        discounts = self.gamma ** included.sum(axis=1, keepdims=True).astype(np.float32)  # (B, 1)
+        last = (positions + last_step) % self.buffer_size
+        dones = (self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None]  # (B, 1)
+        samples = SequenceReplayBufferSamples(
+            observations=self._observations(positions, envs, env),
+            actions=self._tensor(self.actions[positions, envs]),
+            next_observations=self._observations(last, envs, env, following=True),
+            dones=self._tensor(dones),
+            rewards=self._tensor(returns.astype(np.float32, copy=False)),
+            discounts=self._tensor(discounts.astype(np.float32, copy=False)),
+            indices=positions * self.n_envs + envs,
+            weights=self._tensor(np.ones(len(positions), dtype=np.float32)),
+        )
+        if depth == 0:
+            return samples
+        mask = steps[:depth] <= first_end[:, None]  # (B, M)
+        # Beyond the end, the last transition is repeated: nothing of another episode gets in, masked or not.
+        rollout = (positions[:, None] + np.minimum(steps[:depth], first_end[:, None])) % self.buffer_size
+        return samples._replace(
+            rollout_observations=self._observations(rollout, columns, env, following=True),
+            rollout_actions=self._tensor(self.actions[rollout, columns, 0]),
+            rollout_rewards=self._tensor((rewards[:, :depth] * mask).astype(np.float32, copy=False)),
+            mask=self._tensor(mask.astype(np.float32)),
+        )
+
+    def _observations(
+        self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, following: bool = False
+    ) -> PyTorchObs:
+        """
+        :param positions: of transitions, (...)
+        :param envs: (...), broadcast against ``positions``
+        :param following: the observations after these transitions, not the ones before
+        :return: (..., *obs_shape), or a dict of these
+        """
+        found = {key: store.observations(positions, envs, following) for key, store in self._stores.items()}
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        observations = self._normalize_obs(found if is_dict else found[""], env)
+        if isinstance(observations, dict):
+            return {key: self._tensor(obs) for key, obs in observations.items()}
+        return self._tensor(observations)
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.as_tensor(array, device=self.device)  # arrays here are copies already
+
+    def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
+        shape = (self.n_envs, *store.obs_shape)
+        if obs.shape == shape[:1]:  # Discrete
+            return obs.reshape(shape)
+        if obs.shape != shape:
+            raise ValueError(
+                f"observations: expected the shape {shape} of the replay buffer, found {obs.shape}. "
+                "Wrappers that change the shape (VecTransposeImage, VecFrameStack) belong inside VecNormalize."
+            )
+        return obs
+
+
+class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
+    """
+    Proportional prioritised replay (Schaul et al. 2016, https://arxiv.org/abs/1511.05952) of the same windows:
+    P(i) ∝ p_i^α over all environments, weights w_i = (N P(i))^−β over their maximum in the batch.
+
+    A transition enters with the largest priority so far, as soon as its window is complete.
+    See :class:`SequenceReplayBuffer` for the other parameters.
+
+    :param alpha: α ≥ 0; 0 is uniform; 0.5 in Table 5
+    :param beta: β in [0, 1] at the start of training, 0.4 in Table 5; the attribute is read at each call of ``sample``
+    :param final_beta: β in [0, 1] at the end of training, reached linearly; 1 in Table 5. With ``alpha=0.5, beta=0.5``, 0.5
+        gives the weights 1/√P of BBF (https://arxiv.org/abs/2305.19452)
+    """
+
+    PRIORITY_EPS = 1e-6  # keeps a sample of zero error drawable
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        prediction_depth: int = 0,
+        frame_stack: int = 1,
+        alpha: float = 0.5,
+        beta: float = 0.4,
+        final_beta: float = 1.0,
+    ):
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs,
+            optimize_memory_usage,
+            handle_timeout_termination,
+            n_steps,
+            gamma,
+            prediction_depth,
+            frame_stack,
+        )
+        check_number("alpha (priority exponent)", alpha, 0)
+        check_number("beta (importance weights)", beta, 0, 1)
+        check_number("final_beta (importance weights)", final_beta, 0, 1)
+        self.alpha = alpha
+        self.beta = self.initial_beta = beta
+        self.final_beta = final_beta
+        self._tree = SumTree(self.buffer_size * n_envs)
+        self._max_priority = 1.0  # p^α of the largest priority so far
+        self._tree_window = self.window  # the window that the tree's zeros stand for
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of everything stored, in bytes."""
+        return super().nbytes + self._tree.nbytes
+
+    def can_sample(self) -> bool:
+        return super().can_sample() and self.size() >= self.window
+
+    def reset(self) -> None:
+        super().reset()
+        self._tree = SumTree(self.buffer_size * self.n_envs)
+        self._max_priority = 1.0
+
+    def add(self, *args, **kwargs) -> None:
+        self._follow_window()
+        super().add(*args, **kwargs)
+        self._set_ages(0, 1, 0.0)  # what was overwritten
+        self._set_ages(self._tree_window - 1, self._tree_window, self._max_priority)
+
+    def anneal_beta(self, progress_remaining: float) -> None:
+        """
+        :param progress_remaining: from 1 (start of training) to 0
+        """
+        self.beta = self.final_beta + (self.initial_beta - self.final_beta) * progress_remaining
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
+        """As :class:`SequenceReplayBuffer` does, stratified by priority; ``indices`` is for :meth:`update_priorities`."""
+        self._follow_window()
+        leaves = self._tree.sample(batch_size, np.random.random_sample(batch_size))
+        priorities = self._tree.get(leaves)
+        # (N P(i))^-β over its maximum: N and the sum of priorities cancel.
+        weights = (priorities.min() / priorities) ** self.beta
+        samples = self._windows(*np.divmod(leaves, self.n_envs), env)
+        return samples._replace(weights=self._tensor(weights.astype(np.float32)))
+
+    def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
+        """
+        :param indices: of the samples, (B,)
+        :param priorities: their new priorities p ≥ 0, (B,); entries that are not finite are passed over, and samples that
+            cannot be drawn any more
+        """
+        scaled = (priorities.cpu().numpy().astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
+        # A start that was overwritten, or has no whole window any more, stays at 0.
+        takes_part = np.isfinite(scaled) & (self._tree.get(indices) > 0)
+        if not takes_part.all():
+            indices, scaled = indices[takes_part], scaled[takes_part]
+        if len(scaled) > 0:
+            self._tree.set(indices, scaled)
+            self._max_priority = max(self._max_priority, float(scaled.max()))
+
+    def _follow_window(self) -> None:
+        """Open or close the youngest starts where n or M has moved."""
+        if self.window < self._tree_window:
+            self._set_ages(self.window - 1, self._tree_window - 1, self._max_priority)
+        elif self.window > self._tree_window:
+            self._set_ages(self._tree_window - 1, self.window - 1, 0.0)
+        self._tree_window = self.window
+
+    def _set_ages(self, youngest: int, end: int, priority: float) -> None:
+        """Give one priority to the transitions of ages ``youngest`` to ``end`` - 1; the newest has age 0."""
+        ages = np.arange(youngest, min(end, self.size()))
+        positions = (self.pos - 1 - ages) % self.buffer_size
+        leaves = (positions[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()
+        self._tree.set(leaves, priority)

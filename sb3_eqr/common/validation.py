@@ -1,0 +1,192 @@
+"""Checks, as pure functions: each raises with what was expected, what was found and what to do, or does nothing."""
+
+import inspect
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from functools import wraps
+from typing import Any, ParamSpec
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+P = ParamSpec("P")
+
+
+def check_number(name: str, value: Any, low: float, high: float = np.inf, whole: bool = False) -> None:
+    """
+    :param name: of the argument
+    :param value: what was given
+    :param low: smallest legal value
+    :param high: largest legal value
+    :param whole: whether it must be an integer
+    :raises ValueError: if it is no finite number in that range
+    """
+    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+    if not isinstance(value, kinds) or not (np.isfinite(value) and low <= value <= high):
+        kind = "a whole number" if whole else "a finite number"
+        legal = f" of at least {low}" if high == np.inf else f" in [{low}, {high}]"
+        legal = "" if (low, high) == (-np.inf, np.inf) else legal
+        raise ValueError(f"{name}: expected {kind}{legal}, found {value!r}")
+
+
+def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
+    """
+    :param what: the name of the values, for the message
+    :param values: from the environment; integers are always finite
+    :param step: number of environment steps so far, for the message
+    :raises ValueError: if one is NaN or infinite
+    """
+    for key, array in values.items() if isinstance(values, dict) else [("", values)]:
+        array = np.asarray(array)
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise ValueError(
+                f"step {step}: expected finite {what}s from the environment, found {array[~np.isfinite(array)].flat[0]} "
+                f"in the {what}{f' {key!r}' if key else ''}. It was not stored and the model is as before. "
+                "Mend the environment; SB3's VecCheckNan tells which action led there."
+            )
+
+
+def check_names(owner: str, given: Iterable[str], legal: Iterable[str]) -> None:
+    """
+    :param owner: whose arguments these are
+    :param given: names of arguments
+    :param legal: the ones that there are
+    :raises TypeError: for another name; the message has the nearest legal one, or all of them
+    """
+    legal = list(legal)
+    for name in given:
+        if name not in legal:
+            near = get_close_matches(name, legal, n=1)
+            advice = f"Did you mean {near[0]!r}?" if near else f"It takes {', '.join(legal)}."
+            raise TypeError(f"{owner} got an unexpected argument {name!r}. {advice}")
+
+
+def answers_misspelt(init: Callable[P, None]) -> Callable[P, None]:
+    """
+    Decorator of a constructor: a misspelt argument is answered in the name of the class that was called, with the nearest
+    legal one. Python would name the class that has defined the constructor.
+    """
+    legal = list(inspect.signature(init).parameters)[1:]
+
+    @wraps(init)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+        check_names(type(args[0]).__name__, kwargs, legal)
+        init(*args, **kwargs)
+
+    return checked
+
+
+def check_action_space(action_space: spaces.Space) -> None:
+    """
+    :raises AssertionError: (SB3's type for this) if actions are not Discrete, counted from 0
+    """
+    if not isinstance(action_space, spaces.Discrete):
+        raise AssertionError(
+            f"The algorithm only supports {spaces.Discrete} as action space, because the Q head has one output per "
+            f"action, but {action_space} was provided. Wrap the environment with discrete actions, "
+            "or use an algorithm for that space (SAC, TQC, PPO)."
+        )
+    if action_space.start != 0:
+        raise AssertionError(
+            f"The algorithm only supports actions that count from 0, but {action_space} was provided. "
+            "Wrap the environment with gymnasium.wrappers.TransformAction."
+        )
+
+
+def check_policy(owner: str, policy: Any, aliases: dict[str, type], observation_space: spaces.Space) -> None:
+    """
+    :param owner: name of the algorithm
+    :param policy: the class that was given
+    :param aliases: the algorithm's own policies by name
+    :raises ValueError: if it is not one of this algorithm, or does not fit the observations
+    """
+    base = aliases["MlpPolicy"]
+    if not (isinstance(policy, type) and issubclass(policy, base)):
+        raise ValueError(
+            f"{owner}: expected a policy derived from {base.__name__}, found {policy}. "
+            f"Use one of {list(aliases)}; a file is loaded by the class that saved it."
+        )
+    if issubclass(policy, aliases["MultiInputPolicy"]) and not isinstance(observation_space, spaces.Dict):
+        raise ValueError(
+            f"MultiInputPolicy: expected a Dict observation space, found {observation_space}. "
+            "Use MlpPolicy for vectors, CnnPolicy for images."
+        )
+
+
+def check_normalization(normalize: VecNormalize | None, observation_space: spaces.Space) -> None:
+    """
+    :param normalize: the wrapper, if there is one
+    :param observation_space: of the outermost wrapper
+    :raises ValueError: if a wrapper around it changes observations: their originals could not be stored
+    """
+    if normalize is not None and normalize.observation_space != observation_space:
+        raise ValueError(
+            f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
+            f"originals; found {normalize.observation_space} there, {observation_space} outside. "
+            "Use VecNormalize(VecTransposeImage(env)), for images."
+        )
+
+
+def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], set_by_owner: Iterable[str]) -> None:
+    """
+    :param owner: name of the algorithm
+    :param chosen: ``replay_buffer_class`` as it was given, or ``None``
+    :param base: the class that it must be derived from
+    :param kwargs: ``replay_buffer_kwargs`` as they were given
+    :param set_by_owner: arguments of the buffer that are arguments of the algorithm
+    :raises ValueError: for another class, or for an argument that belongs to the algorithm
+    """
+    if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, base)):
+        raise ValueError(
+            f"replay_buffer_class: expected {base.__name__} or a class derived from it, found {chosen}. "
+            "Leave it out to get the one that prioritized_replay asks for."
+        )
+    for name in set_by_owner:
+        if name in kwargs:
+            raise ValueError(
+                f"replay_buffer_kwargs: expected arguments that {owner} does not set itself, found "
+                f"{name!r}. Pass {name}={kwargs[name]!r} to {owner}."
+            )
+
+
+def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, initial_gamma: float | None) -> None:
+    """
+    :param td_coef: weight of the TD loss
+    :param depth: M as it is used, 0 where no auxiliary loss is on
+    :param batch_size: B
+    :param gamma: γ at the end of annealing
+    :param initial_gamma: γ at its start, or ``None``
+    :raises ValueError: if nothing is minimised, or if these do not fit together
+    """
+    if td_coef == 0 and depth == 0:
+        raise ValueError(
+            "td_coef: expected a weight above 0 where no auxiliary loss is on, found 0. "
+            "Pass prediction_depth >= 1 and one of aet_coef, symmetry_coef, reward_coef above 0."
+        )
+    if depth > 0 and batch_size < 2:
+        raise ValueError(
+            f"batch_size: the latent model's batch norm needs at least 2 samples, found {batch_size}. "
+            "Pass a larger batch_size or prediction_depth=0."
+        )
+    if initial_gamma is not None and max(initial_gamma, gamma) == 1:
+        raise ValueError(
+            f"resets: initial_gamma: expected it and gamma below 1, since 1 - γ is annealed by a factor, found "
+            f"{initial_gamma} and {gamma}. Pass initial_gamma=None for a constant γ."
+        )
+
+
+def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> None:
+    """
+    Shapes do not tell whose parameters these are: SE(2) with 4 blocks and T(2) with 18 have equal ones.
+
+    :param expected: ``EqRPolicy.description`` of the model
+    :param found: that of the parameters
+    :raises ValueError: if they differ
+    """
+    for name in expected:
+        if found.get(name, expected[name]) != expected[name]:
+            raise ValueError(
+                f"{name}: expected parameters for {expected[name]!r}, found parameters for {found[name]!r}. "
+                "Build the model with the policy_kwargs of the file, or use load(), which does."
+            )
