@@ -73,7 +73,7 @@ def test_gradients(name, parameterization):
 
 
 def random_params(group, seed):
-    params = th.randn(2, group.num_params, generator=th.Generator().manual_seed(seed), dtype=th.float64)
+    params = th.randn(1, group.num_params, generator=th.Generator().manual_seed(seed), dtype=th.float64)
     if "GL" in group.name:
         params = params + 4 * group_identity_params(group)
     return params.requires_grad_()

@@ -57,14 +57,14 @@ def rotation_world(kappa, rho_angle=0.0, mask=None):
 def test_the_true_kappa_has_no_transition_loss():
     losses, _ = rotation_world(ActionAngle(0.7))
     assert losses.aet.abs().max() < 1e-14
-    assert losses.get.abs().max() < 1e-14
+    assert losses.symmetry.abs().max() < 1e-14
 
 
 def test_wrong_kappas_cost_what_geometry_says():
     """Two unit-normed rotation matrices that differ by the angle δ lie 2 − 2 cos δ apart."""
     losses, turns = rotation_world(ActionAngle(0.0))  # never moves
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).sum(axis=1), atol=1e-12)
-    np.testing.assert_allclose(losses.get, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
+    np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
     losses, turns = rotation_world(ActionAngle(-0.7))  # moves the wrong way
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).sum(axis=1), atol=1e-12)
 
@@ -72,7 +72,7 @@ def test_wrong_kappas_cost_what_geometry_says():
 def test_a_wrong_rho_costs_get_alone():
     losses, _ = rotation_world(ActionAngle(0.7), rho_angle=0.4)
     assert losses.aet.abs().max() < 1e-14
-    np.testing.assert_allclose(losses.get, [2 - 2 * math.cos(0.4)] * 3, atol=1e-12)
+    np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.4)] * 3, atol=1e-12)
 
 
 def test_reward_loss_by_hand():
@@ -158,7 +158,7 @@ def test_against_loops_over_samples_and_blocks():
         kappa = elements(case["target"].transition, start, np.eye(5)[case["actions"][i, 0]])
         right = np.stack([r @ k @ p for r, k, p in zip(rho, kappa, blocks(partner), strict=True)]).ravel()
         get = distance(run(model.projection, left), run(case["target"].projection, right))
-        assert losses.get[i].item() == pytest.approx(get, rel=1e-10)
+        assert losses.symmetry[i].item() == pytest.approx(get, rel=1e-10)
 
 
 @pytest.mark.parametrize("reward_loss", ["mse", "categorical"])
@@ -199,7 +199,7 @@ def test_gradients_go_where_the_design_says():
 
     assert grads(losses.aet) == {"state", "transition", "p"}
     assert grads(losses.reward) == {"state", "transition", "reward_net"}
-    assert grads(losses.get) == {"state", "transition", "action_symmetry", "projection"}
+    assert grads(losses.symmetry) == {"state", "transition", "action_symmetry", "projection"}
     assert all(p.grad is None for p in case["target"].parameters())
 
 
@@ -216,7 +216,7 @@ def test_the_group_action_between_states_carries_no_gradient():
     targets = rotation(np.zeros((3, 2)))
     losses = model(state, th.zeros(3, 1).long(), None, th.ones(3, 1), targets, model, None, identity)
     assert losses.aet is None and losses.reward is None
-    losses.get.sum().backward()
+    losses.symmetry.sum().backward()
     np.testing.assert_allclose(angles.grad, np.full((3, 1), -2 * np.sin(0.9)), atol=1e-12)
 
 
@@ -251,7 +251,7 @@ def test_what_is_absent_is_off():
     model, case = random_case()
     th.manual_seed(0)
     full = model.eval()(**case)
-    for name, absent in (("aet", "project"), ("get", "target"), ("reward", "rewards")):
+    for name, absent in (("aet", "project"), ("symmetry", "target"), ("reward", "rewards")):
         th.manual_seed(0)
         losses = model(**{**case, absent: None})
         for field in losses._fields:

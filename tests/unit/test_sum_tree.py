@@ -4,35 +4,43 @@ import pytest
 from sb3_eqr.common.replay.sum_tree import SumTree
 
 
+def leaves_at(priorities, masses):
+    """Which priority the running sum is in at each mass, by NumPy alone."""
+    return np.searchsorted(np.cumsum(priorities), masses, side="right")
+
+
 @pytest.mark.parametrize("capacity", [1, 2, 3, 7, 64, 65, 100, 1000])
-def test_find_is_the_running_sum(capacity):
+def test_draws_follow_the_running_sum(capacity):
     rng = np.random.default_rng(capacity)
     priorities = rng.random(capacity) * (rng.random(capacity) < 0.7) + (np.arange(capacity) == 0)
     tree = SumTree(capacity)
     tree.set(np.arange(capacity), priorities)
-    masses = rng.random(1000) * priorities.sum() * (1 - 1e-9)
-    expected = np.searchsorted(np.cumsum(priorities), masses, side="right")
-    assert np.array_equal(tree.find(masses), expected)
+    uniforms = rng.random(1000)
+    masses = (np.arange(1000) + uniforms) * (priorities.sum() / 1000)  # one from each of 1,000 equal ranges
+    assert np.array_equal(tree.sample(1000, uniforms), leaves_at(priorities, masses))
 
 
 def test_masses_on_the_edges_never_find_an_empty_leaf():
-    tree = SumTree(6)
-    tree.set(np.array([1, 4]), np.array([0.1, 0.2]))
-    total = 0.1 + 0.2
-    masses = np.array([0.0, 0.1, np.nextafter(0.1, 0), total, np.nextafter(total, 1), 0.05])
-    assert tree.find(masses).tolist() == [1, 4, 1, 4, 4, 1]
-
-
-def test_edges_between_blocks_never_find_an_empty_leaf():
-    """Most leaves empty, sizes that round: masses at, just below and just above every running sum."""
+    """Priorities are binary fractions, so that masses at, just below and just above every running sum are exact."""
     rng = np.random.default_rng(0)
-    for _ in range(20):
-        priorities = rng.random(500) ** 9 * (rng.random(500) < 0.05) + 1e-9 * (np.arange(500) == 300)
+    for _ in range(5):
+        priorities = np.where(rng.random(500) < 0.05, 2.0 ** rng.integers(-9, 0, 500), 0.0)
+        priorities[300] += 1.0
+        priorities[123] += 2.0 ** np.ceil(np.log2(priorities.sum())) - priorities.sum()  # the total is a power of two
         tree = SumTree(500)
         tree.set(np.arange(500), priorities)
+        total = priorities.sum()
         sums = np.cumsum(priorities)
-        masses = np.concatenate([[0.0], sums, np.nextafter(sums, 0), np.nextafter(sums, 9), tree._running_sum()])
-        assert (tree.get(tree.find(masses)) > 0).all()
+        masses = np.concatenate([[0.0], sums[sums < total], np.nextafter(sums, 0), np.nextafter(sums[sums < total], total)])
+        found = np.array([tree.sample(1, np.array([mass / total]))[0] for mass in masses])
+        assert np.array_equal(found, leaves_at(priorities, masses)) and (tree.get(found) > 0).all()
+
+
+def test_rounding_does_not_lead_behind_the_last_priority():
+    tree = SumTree(6)
+    tree.set(np.array([1, 4]), np.array([0.1, 0.2]))  # 0.1 + 0.2 > 0.3
+    assert tree.sample(1, np.array([np.nextafter(1.0, 0)])).tolist() == [4]
+    assert tree.sample(1, np.array([1.0])).tolist() == [4]  # a mass of the whole total
 
 
 def test_sums_do_not_drift():
@@ -44,8 +52,9 @@ def test_sums_do_not_drift():
         tree.set(leaves, priorities)
         values[leaves] = priorities
     assert np.array_equal(tree.get(np.arange(150)), values)
-    masses = rng.random(500) * values.sum() * (1 - 1e-12)
-    assert np.array_equal(tree.find(masses), np.searchsorted(np.cumsum(values), masses, side="right"))
+    uniforms = rng.random(500)
+    masses = (np.arange(500) + uniforms) * (values.sum() / 500)
+    assert np.array_equal(tree.sample(500, uniforms), leaves_at(values, masses))
 
 
 def test_draws_are_proportional_and_stratified():
