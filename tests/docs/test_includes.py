@@ -1,0 +1,202 @@
+"""
+Each ``literalinclude`` of the pages shows the code that its text is about.
+
+Sphinx's own reader reads the code. ``PROMISES`` says, for each include, which phrases the code must have and which names
+the text before it must mention.
+"""
+
+import ast
+import pathlib
+import re
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+from sphinx.directives.code import LiteralIncludeReader
+
+ROOT = pathlib.Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
+LEGAL_OPTIONS = {"pyobject", "start-at", "end-before", "dedent"}  # line numbers go stale
+
+INCLUDE = re.compile(r"^```\{literalinclude\} (\S+)\n(.*?)^```$", re.M | re.S)
+
+
+class Include(NamedTuple):
+    """A ``literalinclude`` of a page."""
+
+    target: str  # what PROMISES calls it: the file within the repository, and the object or the first line
+    lead: str  # the text between the heading or block before it and this one
+    code: str
+
+
+class Promise(NamedTuple):
+    """What the reader of a page expects of an include."""
+
+    code: tuple[str, ...]  # phrases of the included code; no other include of the page has them all
+    text: tuple[str, ...]  # phrases of the text before it
+
+
+# page -> include -> promise, in the order of the page
+PROMISES: dict[str, dict[str, Promise]] = {
+    "losses.md": {
+        "sb3_eqr/common/objective.py, Objective.__call__": Promise(
+            code=(
+                "self.policy.online.encode(observations)",
+                "loss = (samples.weights * sum(",
+                ").mean()",
+                "return LossTerms(",
+            ),
+            text=("`Objective.__call__`", "`reward_coef`", "`aet_coef`", "`symmetry_coef`", "`td_coef`", "$w_i$"),
+        ),
+        "sb3_eqr/common/latent_model.py, LatentModel.rollout": Promise(
+            code=("self.act(self.action_element(state, action), state)", "th.stack(states, dim=1)"),
+            text=("`LatentModel.rollout`", r"\hat x_m = \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}"),
+        ),
+        "sb3_eqr/common/losses.py, normalized_distance": Promise(
+            code=("F.normalize(prediction, dim=-1) - F.normalize(target, dim=-1)", "difference.square().sum(dim=-1)"),
+            text=("`normalized_distance`", r"\rVert_2^2 = 2 - 2 \cos(y, \bar y)"),
+        ),
+        "sb3_eqr/common/latent_model.py, if project is not None:": Promise(
+            code=(
+                "target_project(target_states[:, 1:])",
+                "AET_LOSSES[self.aet_loss](project(predicted), target_projected, mask)",
+            ),
+            text=("`LatentModel.forward`", "`AET_LOSSES`", r"L_{\mathrm{AET}}"),
+        ),
+        "sb3_eqr/common/networks/layers.py, DistributionalHead.project": Promise(
+            code=("[self.advantage] if self.value is None else [self.value, self.advantage]", "stream[0](rows)"),
+            text=("`DistributionalHead.project`", "first layer of the Q head"),
+        ),
+        "sb3_eqr/common/losses.py, contrastive_loss": Promise(
+            code=("cosines / TEMPERATURE", "F.cross_entropy(logits"),
+            text=("`contrastive_loss`", '`policy_kwargs=dict(aet_loss="contrastive")`', r"\sum_{j=1}^{B} \exp"),
+        ),
+        "sb3_eqr/common/latent_model.py, LatentModel._symmetry_loss": Promise(
+            code=("symmetry = self.group.compose(self.blocks(partner), inverse)", "self.action_symmetry(", "th.no_grad()"),
+            text=("`LatentModel._symmetry_loss`", "`symmetry_coef`", r"\tau_g = \bar x^{(j)}_0 \, x_0^{-1}"),
+        ),
+        "sb3_eqr/common/losses.py, reward_mse": Promise(
+            code=("(prediction.squeeze(-1) - reward).square()",),
+            text=("`reward_mse`", r"\left(r_\psi(\hat x_m) - r_{t+m}\right)^2"),
+        ),
+        "sb3_eqr/common/losses.py, reward_cross_entropy": Promise(
+            code=("reward.sign().long() + 1", "F.cross_entropy("),
+            text=("`reward_cross_entropy`", '`policy_kwargs=dict(reward_loss="categorical")`'),
+        ),
+        "sb3_eqr/common/objective.py, Objective._td_terms": Promise(
+            code=(
+                "online.head(chooser_state, noisy=True) if self.double_q else next_outputs",
+                "online.expectation(chooser).argmax(dim=1",
+                "online.td_loss(current, following, samples.rewards, discounts)",
+            ),
+            text=("`Objective._td_terms`", "`double_q`", "`td_loss`"),
+        ),
+        "sb3_eqr/eqr_qrdqn/policies.py, EqRQuantileNetwork.td_loss": Promise(
+            code=("quantile_huber_loss(current, rewards + discounts * following)", "return loss, loss.detach()"),
+            text=("`EqRQuantileNetwork.td_loss`", "The priority of a sample is its loss", "`following`"),
+        ),
+        "sb3_eqr/common/losses.py, quantile_huber_loss": Promise(
+            code=("abs_delta - 0.5, delta**2 * 0.5", "(asymmetry * huber).sum(dim=1).mean(dim=1)"),
+            text=("`quantile_huber_loss`", r"\mathcal{H}(y_j - \theta_i)"),
+        ),
+        "sb3_eqr/eqr_rainbow/policies.py, EqRCategoricalNetwork.td_loss": Promise(
+            code=("values = rewards + discounts * self.support", "return categorical_loss(current, target)"),
+            text=("`EqRCategoricalNetwork.td_loss`", "`v_min`", "`v_max`"),
+        ),
+        "sb3_eqr/common/losses.py, categorical_projection": Promise(
+            code=(".clamp(0, n_atoms - 1)", "(probabilities[:, :, None] * shares).sum(dim=1)"),
+            text=("`categorical_projection`", r"\Delta z = (v_{\max} - v_{\min}) / (N - 1)"),
+        ),
+        "sb3_eqr/common/losses.py, categorical_loss": Promise(
+            code=("-(target * logits.log_softmax(dim=1)).sum(dim=1)", "th.xlogy(target, target)"),
+            text=("`categorical_loss`", "cross-entropy", "KL divergence"),
+        ),
+        "sb3_eqr/common/eqr_algorithm.py, EqRAlgorithm.train": Promise(
+            code=(
+                "buffer.sample(batch_size",
+                "terms.loss.backward()",
+                "clip_grad_norm_(self._trained, max_norm)",
+                "optimizer.step()",
+                "policy.update_target(self.tau)",
+                "buffer.update_priorities(samples.indices, terms.priorities)",
+            ),
+            text=("`EqRAlgorithm.train`", "Algorithm 1", "`gradient_steps`"),
+        ),
+    },
+}
+
+
+def name_of(page):
+    return str(page.relative_to(DOCS))
+
+
+def includes_of(text, page):
+    """
+    :param text: of the page
+    :param page: where it lies, for relative paths
+    :raises ValueError: by Sphinx, where the object or the line is not in the file
+    """
+    found = []
+    for match in INCLUDE.finditer(text):
+        options = dict(re.findall(r"^:([\w-]+): *(.*)$", match[2], re.M))
+        assert options.keys() <= LEGAL_OPTIONS, options
+        if "dedent" in options:
+            options["dedent"] = int(options["dedent"])
+        path = (page.parent / match[1]).resolve()
+        code, _ = LiteralIncludeReader(str(path), options, SimpleNamespace(source_encoding="utf-8")).read()
+        assert len(ast.parse(code).body) == 1, f"{match[0]}: one function or statement, from its first line to its last"
+        what = options.get("pyobject") or options.get("start-at", "")
+        lead = re.split(r"^(?:#+ .*|```)$", text[: match.start()], flags=re.M)[-1]
+        found.append(Include(f"{path.relative_to(ROOT)}, {what}", lead, code))
+    return found
+
+
+def check(text, page, promises):
+    """Fail unless the includes of a page are those of the table and keep what it promises."""
+    includes = includes_of(text, page)
+    assert [include.target for include in includes] == list(promises)
+    assert text.count("{literalinclude}") == len(includes)  # none in another spelling
+    for include in includes:
+        promise = promises[include.target]
+        for phrase in promise.code:
+            assert phrase in include.code, f"{include.target} does not show {phrase!r}"
+        lead = " ".join(include.lead.split())
+        for phrase in promise.text:
+            assert phrase in lead, f"the text before {include.target} does not mention {phrase!r}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_includes_show_what_the_text_is_about(page):
+    check(page.read_text(encoding="utf-8"), page, PROMISES.get(name_of(page), {}))
+
+
+def test_a_promise_is_kept_by_one_include_only():
+    """Otherwise an include could show another function and nobody would notice."""
+    for name, promises in PROMISES.items():
+        page = DOCS / name
+        code_of = {include.target: include.code for include in includes_of(page.read_text(encoding="utf-8"), page)}
+        for target, promise in promises.items():
+            assert [other for other, code in code_of.items() if all(phrase in code for phrase in promise.code)] == [target]
+
+
+TAMPERED = {  # what goes wrong with a page -> a replacement in it, what it raises
+    "another function": ("pyobject: reward_mse", "pyobject: normalized_distance", AssertionError),
+    "a function that is gone": ("pyobject: LatentModel.rollout", "pyobject: LatentModel.unroll", ValueError),
+    "a line that is gone": ("start-at: if project is not None:", "start-at: if project is not nothing:", ValueError),
+    "more than one statement": ("end-before: if target is not None:", "end-before: return LatentLosses", AssertionError),
+    "half a statement": ("end-before: if target is not None:", "end-before: target_projected =", SyntaxError),
+    "line numbers": (":pyobject: reward_mse", ":lines: 3-9", AssertionError),
+    "a file that is gone": ("../sb3_eqr/common/objective.py", "../sb3_eqr/objective.py", OSError),
+    "an include without a promise": ("## Reward", "```{literalinclude} ../sb3_eqr/cli.py\n```\n\n## Reward", AssertionError),
+    "text about something else": ("by `reward_mse`", "by another loss", AssertionError),
+}
+
+
+@pytest.mark.parametrize("old, new, error", TAMPERED.values(), ids=TAMPERED)
+def test_what_goes_wrong_is_found(old, new, error):
+    page = DOCS / "losses.md"
+    text = page.read_text(encoding="utf-8")
+    assert old in text
+    with pytest.raises(error):
+        check(text.replace(old, new, 1), page, PROMISES["losses.md"])
