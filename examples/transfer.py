@@ -46,12 +46,11 @@ def make_agent(goal: str, seed: int, frozen: bool) -> EqRQRDQN:
         learning_starts=300,
         gradient_steps=1,
         n_steps=3,
-        aet_loss="contrastive",
         aet_coef=0.0 if frozen else 1.0,
         symmetry_coef=0.0,
         exploration_fraction=0.15,
         shift_pixels=0,
-        policy_kwargs={**STATES, "projection": "none"},
+        policy_kwargs={**STATES, "aet_loss": "contrastive", "projection": "none"},
         seed=seed,
     )
 
