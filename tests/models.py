@@ -6,6 +6,7 @@ import pytest
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.objective import LossCoefs
 
 SMALL = {
     "learning_starts": 40,
@@ -36,3 +37,17 @@ MAKERS = [Maker(EqRQRDQN, "n_quantiles"), Maker(EqRRainbow, "n_atoms")]
 
 # For slow questions that have nothing to do with the head.
 EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRainbow"])
+
+
+def loss_terms(model, samples):
+    """What an update on these samples minimises."""
+    return model.objective(samples, LossCoefs(model.td_coef, model.aet_coef, model.symmetry_coef, model.reward_coef))
+
+
+def train_on(model, samples):
+    """One update on samples of one's own choice."""
+    model.replay_buffer.sample = lambda *args, **kwargs: samples
+    try:
+        model.train(1, len(samples.indices))
+    finally:
+        del model.replay_buffer.sample

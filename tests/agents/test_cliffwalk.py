@@ -7,7 +7,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from sb3_eqr.envs import BlindCliffwalk
-from tests.test_package import ROOT
+from tests.tools.test_package import ROOT
 
 sys.path.insert(0, str(ROOT / "examples"))
 from blind_cliffwalk import make_model, updates_needed

@@ -16,7 +16,7 @@ from sb3_eqr.common.networks.trunks import ImpalaTrunk
 from sb3_eqr.configurations import configuration_files
 from tests.toys import ImageEnv
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parents[2]
 SMALL = {"learning_starts": 140, "buffer_size": 400, "batch_size": 8, "device": "cpu", "seed": 0}
 
 # name: encoder, auxiliary losses
@@ -77,8 +77,8 @@ def test_each_is_trained_as_the_table_says(name):
     network["net_arch"] = [32]
     if name == "eqr_bbf":
         network["features_extractor_kwargs"]["width_scale"] = 0.25
-        assert arguments["reset_interval"] == 40_000 and arguments["annealing_steps"] == 10_000
-        arguments.update(reset_interval=70, annealing_steps=30)
+        assert arguments["resets"]["interval"] == 40_000 and arguments["resets"]["annealing_steps"] == 10_000
+        arguments["resets"].update(interval=70, annealing_steps=30)
     kept = {key: value for key, value in arguments.items() if key not in SMALL}
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
     model = EqRRainbow("CnnPolicy", env, **kept, **SMALL, policy_kwargs=network)
@@ -136,9 +136,10 @@ def test_eqr_bbf_is_the_recipe():
     decays = {p.ndim: group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
     assert decays == {4: 0.1, 2: 0.1, 1: 0.0}
     assert (model.tau, model.target_update_interval, model.max_grad_norm) == (0.005, None, None)
-    assert (model.priority_alpha, model.priority_beta, model.priority_final_beta) == (0.5, 0.5, 0.5)
-    assert (model.initial_n_steps, model.n_steps, model.initial_gamma, model.gamma) == (10, 3, 0.97, 0.997)
-    assert (model.annealing_steps, model.reset_interval, model.reset_shrink_factor) == (10_000, 40_000, 0.5)
+    buffer, resets = model.replay_buffer, model.resets
+    assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.5, 0.5)
+    assert (resets.initial_n_steps, model.n_steps, resets.initial_gamma, model.gamma) == (10, 3, 0.97, 0.997)
+    assert (resets.annealing_steps, resets.interval, resets.shrink_factor) == (10_000, 40_000, 0.5)
     assert (model.prediction_depth, model.aet_coef, model.symmetry_coef) == (5, 5, 5)
     assert (model.gradient_steps, model.train_freq.frequency, model.batch_size) == (2, 1, 32)
     assert model.policy.act_with_target and model.double_q

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
-from tests.models import EITHER, SMALL
+from tests.models import EITHER, SMALL, loss_terms
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 
 
@@ -35,22 +35,21 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"batch_size": 32.0}, "batch_size: expected a whole number"),
         ({"aet_coef": None}, "aet_coef: expected a finite number"),
         ({"tau": None}, "tau: expected a finite number"),
-        ({"priority_alpha": float("nan")}, "alpha"),
+        ({"replay_buffer_kwargs": {"alpha": float("nan")}}, "alpha"),
         ({"policy_kwargs": {"latent_hidden_dim": 0}}, "latent_hidden_dim: expected a whole number of at least 1"),
         ({"policy_kwargs": {"group": 2}}, "expected GL\\(n\\), SE\\(n\\).*found 2"),
         ({"policy_kwargs": {"group": None}}, "Pass symmetry_coef=0"),
         ({"replay_buffer_class": "x"}, "expected SequenceReplayBuffer"),
         ({"replay_buffer_kwargs": {"n_steps": 1}}, "Pass n_steps=1 to EqR"),
-        ({"replay_buffer_kwargs": {"alpha": 0.7}}, "Pass priority_alpha=0.7 to EqR"),
         ({"tau": 1.5}, "tau: expected a finite number in \\[0, 1\\], found 1.5"),
         ({"aet_coef": -1.0}, "aet_coef: expected a finite number of at least 0"),
         ({"reward_coef": float("nan")}, "reward_coef"),
         ({"shift_pixels": -4}, "shift_pixels"),
-        ({"reward_loss": "huber"}, "reward_loss: expected one of"),
+        ({"policy_kwargs": {"reward_loss": "huber"}}, "reward_loss: expected one of"),
         ({"n_steps": 0}, "n_steps"),
         ({"gamma": 1.01}, "gamma"),
-        ({"priority_alpha": -1.0}, "alpha"),
-        ({"priority_beta": 1.4}, "beta"),
+        ({"replay_buffer_kwargs": {"alpha": -1.0}}, "alpha"),
+        ({"replay_buffer_kwargs": {"beta": 1.4}}, "beta"),
         ({"batch_size": 1}, "at least 2 samples"),
         ({"replay_buffer_class": ReplayBuffer}, "expected SequenceReplayBuffer"),
         ({"policy": QRDQNPolicy}, "expected a policy derived from EqR(QRDQN|Rainbow)Policy"),
@@ -59,15 +58,18 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"policy_kwargs": {"sigma_init": -1.0}}, "sigma_init"),
         ({"policy": "LstmPolicy"}, "LstmPolicy unknown"),
         ({"train_freq": (1, "hour")}, "'step' or 'episode'"),
-        ({"priority_final_beta": 1.5}, "priority_final_beta: expected a finite number in \\[0, 1\\], found 1.5"),
-        ({"initial_n_steps": 0}, "initial_n_steps: expected a whole number of at least 1"),
-        ({"initial_n_steps": 497, "buffer_size": 499}, "prediction_depth \\+ 1 = 500 transitions per environment, found 499"),
-        ({"initial_gamma": -0.1}, "initial_gamma: expected a finite number in"),
-        ({"initial_gamma": 0.9, "gamma": 1.0}, "initial_gamma: expected it and gamma below 1"),
-        ({"annealing_steps": 0}, "annealing_steps"),
-        ({"reset_interval": 0}, "reset_interval: expected a whole number of at least 1"),
-        ({"reset_shrink_factor": 1.5}, "reset_shrink_factor"),
-        ({"reset_fraction": -1}, "reset_fraction"),
+        ({"replay_buffer_kwargs": {"final_beta": 1.5}}, "final_beta .*: expected a finite number in \\[0, 1\\], found 1.5"),
+        ({"resets": {"initial_n_steps": 0}}, "initial_n_steps: expected a whole number of at least 1"),
+        (
+            {"resets": {"initial_n_steps": 497}, "buffer_size": 499},
+            "prediction_depth \\+ 1 = 500 transitions per environment, found 499",
+        ),
+        ({"resets": {"initial_gamma": -0.1}}, "initial_gamma: expected a finite number in"),
+        ({"resets": {"initial_gamma": 0.9}, "gamma": 1.0}, "initial_gamma: expected it and gamma below 1"),
+        ({"resets": {"annealing_steps": 0}}, "annealing_steps"),
+        ({"resets": {"interval": 0}}, "resets: interval: expected a whole number of at least 1"),
+        ({"resets": {"shrink_factor": 1.5}}, "shrink_factor"),
+        ({"resets": {"end": -1}}, "resets: end"),
         (
             {"policy_kwargs": {"optimizer_class": "AdamV"}},
             "optimizer_class: expected a class or a name in torch.optim.*'AdamV'",
@@ -184,8 +186,7 @@ def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, grad
         model.learn(200, callback=Callback())
     assert model._n_updates == sizes[0] == good_rounds * gradient_steps
     assert max(p.abs().max().item() for p in model.policy.parameters()) < 100
-    td, auxiliary = model._compute_losses(model.replay_buffer.sample(8))
-    assert all(th.isfinite(loss).all() for loss in (td.loss, *auxiliary))
+    assert all(th.isfinite(term).all() for term in loss_terms(model, model.replay_buffer.sample(8)))
     model.lr_schedule = lambda progress: 1e-4
     model.learn(50, reset_num_timesteps=False)
 
@@ -240,7 +241,7 @@ def test_supports_that_are_none(support, message):
 
 def test_policy_kwargs_that_there_are_not(make):
     other = "n_atoms" if make.n_atoms_name == "n_quantiles" else "n_quantiles"
-    with pytest.raises(TypeError, match=f"takes no {other}. It takes act_with_target, .*{make.n_atoms_name}.*sigma_init"):
+    with pytest.raises(TypeError, match=f"policy_kwargs: EqR.*Policy got an unexpected argument {other!r}"):
         make(ChainEnv(), policy_kwargs={other: 5})
 
 

@@ -8,6 +8,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
 from sb3_eqr.common.networks.trunks import ConvExtractor
+from sb3_eqr.common.policies import EqRPolicy
 from tests.toys import ChainEnv, ImageEnv
 
 OFF = {
@@ -111,8 +112,8 @@ def test_sharing_the_target_pass_changes_no_number(monkeypatch):
     for shortcut in (True, False):
         settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
-        assert model._target_is_online
-        monkeypatch.setattr(EqRQRDQN, "_target_is_online", shortcut)
+        assert model.policy.target_encodes_as_online
+        monkeypatch.setattr(EqRPolicy, "target_encodes_as_online", shortcut)
         models.append(model.learn(150))
         monkeypatch.undo()
     assert same_state(*models)

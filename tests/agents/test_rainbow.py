@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,10 @@ from stable_baselines3.common.logger import configure
 from sb3_eqr import EqRRainbow
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.networks.trunks import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
-from sb3_eqr.common.resets import anneal_gamma, anneal_n_steps
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
-from tests.models import MAKERS
+from tests.models import MAKERS, loss_terms
 from tests.toys import ChainEnv, ImageEnv
 
 make_rainbow = MAKERS[1]
@@ -57,14 +57,14 @@ def test_double_q_by_hand(double_q, goal):
     obs = th.zeros(1, 3)
     one = th.ones(1, 1)
     samples = SequenceReplayBufferSamples(obs, one.long(), obs, 0 * one, one / 2, one / 2, np.zeros(1, int), th.ones(1))
-    td, _ = model._compute_losses(samples)
+    terms = loss_terms(model, samples)
     cross_entropy = -sum(g * math.log(c) for g, c in zip(goal, current, strict=True))
     entropy = -sum(g * math.log(g) for g in goal if g > 0)
-    assert td.loss.item() == pytest.approx(cross_entropy, rel=1e-5)
-    assert td.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
-    assert td.q_values.item() == pytest.approx(-0.5 + 0.125)
-    terminal, _ = model._compute_losses(samples._replace(dones=one))  # all mass on 0.5: half to 0, half to 1
-    assert terminal.loss.item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
+    assert terms.td.item() == pytest.approx(cross_entropy, rel=1e-5)
+    assert terms.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
+    assert terms.q_values.item() == pytest.approx(-0.5 + 0.125)
+    terminal = loss_terms(model, samples._replace(dones=one))  # all mass on 0.5: half to 0, half to 1
+    assert terminal.td.item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
 
 
 def test_dueling_by_hand():
@@ -147,27 +147,17 @@ def test_acting_with_the_target_network():
 # ---------------------------------------------------------------------------------------------- schedules
 
 
-def test_annealing_by_hand():
-    assert [anneal_n_steps(10, 3, p) for p in (0.0, 0.5, 1.0)] == [10, 5, 3]  # sqrt(30) = 5.48
-    assert [anneal_n_steps(3, 10, p) for p in (0.0, 0.5, 1.0)] == [3, 5, 10]
-    assert anneal_n_steps(None, 3, 0.2) == 3 and anneal_gamma(None, 0.9, 0.2) == 0.9
-    # 1 - γ from 0.03 to 0.003: half-way sqrt(0.03 * 0.003) = 0.00948683
-    np.testing.assert_allclose([anneal_gamma(0.97, 0.997, p) for p in (0.0, 0.5)], [0.97, 0.99051317], rtol=1e-7)
-    assert anneal_gamma(0.97, 0.997, 1.0) == 0.997
-
-
 def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
     """Every draw is watched: its n, its γ, and whether the returns in it are those of that n and γ."""
-    model = make(
-        ChainEnv(), initial_n_steps=8, n_steps=2, initial_gamma=0.5, gamma=0.95, annealing_steps=20, reset_interval=40, seed=1
-    )
+    resets = {"initial_n_steps": 8, "initial_gamma": 0.5, "annealing_steps": 20, "interval": 40}
+    model = make(ChainEnv(), n_steps=2, gamma=0.95, resets=resets, seed=1)
     buffer, used = model.replay_buffer, []
-    gather = buffer._gather
+    windows = buffer._windows
 
-    def watched(positions, envs, *args):
-        samples = gather(positions, envs, *args)
+    def watched(positions, envs, env):
+        samples = windows(positions, envs, env)
         used.append((model._n_updates, buffer.n_steps, buffer.gamma))
-        pairs = zip(positions, samples["rewards"][:, 0], samples["discounts"][:, 0], strict=True)
+        pairs = zip(positions, samples.rewards[:, 0], samples.discounts[:, 0], strict=True)
         for position, found, discount in pairs:
             total, power = 0.0, 1.0
             for step in range(buffer.n_steps):
@@ -180,9 +170,9 @@ def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
             )
         return samples
 
-    monkeypatch.setattr(buffer, "_gather", watched)
+    monkeypatch.setattr(buffer, "_windows", watched)
     model.learn(120)
-    assert model._resets == [40, 80, 120]
+    assert model._resets.done == [40, 80, 120]
     assert [update for update, _, _ in used] == list(range(model._n_updates))
     for update, n_steps, gamma in used:
         share = min(update % 40, 20) / 20 if update < 160 else 1.0
@@ -199,7 +189,7 @@ def test_constant_n_and_gamma_are_left_alone(make):
 
 def test_importance_weights_of_bbf(make):
     """β stays at 1/2: weights are 1/√P over their maximum."""
-    model = make(ChainEnv(), priority_beta=0.5, priority_final_beta=0.5).learn(120)
+    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.5, "final_beta": 0.5}).learn(120)
     assert model.replay_buffer.beta == 0.5
     samples = model.replay_buffer.sample(64)
     found = model.replay_buffer._tree.get(samples.indices)
@@ -208,7 +198,7 @@ def test_importance_weights_of_bbf(make):
 
 
 def test_beta_may_fall(make):
-    model = make(ChainEnv(), priority_beta=0.8, priority_final_beta=0.2).learn(100)
+    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.8, "final_beta": 0.2}).learn(100)
     assert model.replay_buffer.beta == pytest.approx(0.2)
     model._current_progress_remaining = 0.5
     model.train(1, 8)
@@ -221,8 +211,8 @@ def test_beta_may_fall(make):
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
 def test_a_reset_to_the_last_bit(make, alpha, projection):
     network = {"projection": projection}
-    model = make(ChainEnv(), reset_interval=60, reset_shrink_factor=alpha, tau=0.1, policy_kwargs=network).learn(70)
-    assert model._n_updates == 60 and model._resets == []  # the next update comes after a reset
+    model = make(ChainEnv(), resets={"interval": 60, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(70)
+    assert model._n_updates == 60 and model._resets.done == []  # the next update comes after a reset
     old = {name: p.clone() for name, p in model.policy.state_dict().items()}
     state = th.get_rng_state()
     fresh = make(ChainEnv(), policy_kwargs=network)  # takes its seed: put the generator where the reset will find it
@@ -234,7 +224,7 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
     online = "q_net" if make is make_rainbow else "quantile_net"
     kinds = {"fresh": 0, "perturbed": 0, "kept": 0}
     for name, value in new.items():
-        if "_target" in name or "extra_state" in name:
+        if "_target" in name:
             continue
         if ".head." in name or name.startswith("own_projection."):
             assert th.equal(value, drawn[name]) and not th.equal(value, old[name])
@@ -258,26 +248,26 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
 
 
 def test_when_resets_happen(make):
-    model = make(ChainEnv(), reset_interval=30, reset_fraction=0.7).learn(140)  # 200 updates in steps 41 to 140
+    model = make(ChainEnv(), resets={"interval": 30, "end": 0.7}).learn(140)  # 200 updates in steps 41 to 140
     assert model._n_updates == 200
-    assert model._resets == [30, 60, 90]  # 70 % of 140 steps are over after 116 updates
-    assert make(ChainEnv(), reset_interval=7, gradient_steps=3).learn(60)._resets == [7, 14, 21, 28, 35]  # within rounds
-    assert make(ChainEnv()).learn(60)._resets == []
-    assert make(ChainEnv(), reset_interval=30, reset_fraction=0.0).learn(100)._resets == []
+    assert model._resets.done == [30, 60, 90]  # 70 % of 140 steps are over after 116 updates
+    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)._resets.done == [7, 14, 21, 28, 35]  # within rounds
+    assert make(ChainEnv()).learn(60)._resets.done == []
+    assert make(ChainEnv(), resets={"interval": 30, "end": 0.0}).learn(100)._resets.done == []
 
 
 def wait_for_a_longer_window(make):
     """After 4 updates n is to jump from 2 to 60 by a reset, while the buffer has some 45 transitions."""
-    model = make(ChainEnv(), reset_interval=4, n_steps=2, annealing_steps=1).learn(42)
+    model = make(ChainEnv(), n_steps=2, resets={"interval": 4, "annealing_steps": 1}).learn(42)
     assert model._n_updates == 4
-    model.initial_n_steps = 60
+    model._resets.schedule = replace(model._resets.schedule, initial_n_steps=60)
     return model
 
 
 def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
     model = wait_for_a_longer_window(make)
     model.learn(8, reset_num_timesteps=False)
-    assert model._n_updates == 4 and model._resets == [4]
+    assert model._n_updates == 4 and model._resets.done == [4]
     model.learn(30, reset_num_timesteps=False)
     assert model._n_updates > 4
 
@@ -289,28 +279,28 @@ def test_rounds_without_updates_keep_the_last_sound_model(make):
     with th.no_grad():
         next(model.policy.online.features_extractor.parameters()).fill_(float("nan"))
     model.learn(8, reset_num_timesteps=False)
-    assert model._resets == [4]
+    assert model._resets.done == [4]
     with pytest.raises(FloatingPointError, match="put back to update 2 "):
         model.learn(40, reset_num_timesteps=False)
-    assert all(th.isfinite(p).all() for p in model.policy.parameters()) and model._resets == []
+    assert all(th.isfinite(p).all() for p in model.policy.parameters()) and model._resets.done == []
 
 
 def test_resets_are_postponed_not_lost():
     """Within the last tenth of one call of learn; the next call makes up for it."""
-    model = make_rainbow(ChainEnv(), reset_interval=110).learn(100)
-    assert (model._n_updates, model._resets) == (120, [])
+    model = make_rainbow(ChainEnv(), resets={"interval": 110}).learn(100)
+    assert (model._n_updates, model._resets.done) == (120, [])
     model.learn(100, reset_num_timesteps=False)
-    assert model._resets == [120, 230]
+    assert model._resets.done == [120, 230]
 
 
 def test_what_is_frozen_is_not_perturbed():
-    model = make_rainbow(ChainEnv(), reset_interval=30, policy_kwargs={"net_arch": [32, 32]})
+    model = make_rainbow(ChainEnv(), resets={"interval": 30}, policy_kwargs={"net_arch": [32, 32]})
     frozen = [*model.q_net.features_extractor.parameters(), *model.q_net.head.value[0].parameters()]
     for parameter in frozen:
         parameter.requires_grad_(False)
     before = [parameter.clone() for parameter in frozen]
     model.learn(80)
-    assert len(model._resets) > 0 and all(th.equal(a, b) for a, b in zip(before, frozen, strict=True))
+    assert len(model._resets.done) > 0 and all(th.equal(a, b) for a, b in zip(before, frozen, strict=True))
 
 
 class PolicyWithAnArgument(EqRRainbowPolicy):
@@ -335,23 +325,23 @@ def test_a_policy_of_ones_own_is_drawn_with_its_arguments():
 @pytest.mark.usefixtures("backup_each_round")
 def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch):
     """The second update of the round in which the reset was made: back to its start, before the reset."""
-    model = make(ChainEnv(), reset_interval=40).learn(60)
-    assert model._n_updates == 40 and model._resets == []
+    model = make(ChainEnv(), resets={"interval": 40}).learn(60)
+    assert model._n_updates == 40 and model._resets.done == []
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
     moments = {(p, k): v.clone() for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
     model._current_progress_remaining = 0.5
-    update = model._update
+    add = model._monitor.add
 
-    def poisoned(samples):
-        update(samples)
+    def poisoned(metrics):  # at the end of the first update
+        add(metrics)
         model.replay_buffer.rewards[:] = 1e38
 
-    monkeypatch.setattr(model, "_update", poisoned)
+    monkeypatch.setattr(model._monitor, "add", poisoned)
     model.train(gradient_steps=2, batch_size=8)
-    assert model._resets == [40]
+    assert model._resets.done == [40]
     with pytest.raises(FloatingPointError, match=r"update 42: .*put back to update 40 "):
         model.dump_logs()
-    assert model._resets == [] and model._n_updates == 40
+    assert model._resets.done == [] and model._n_updates == 40
     assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
     found = {(p, k): v for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
     assert found.keys() == moments.keys() and all(th.equal(found[key], moments[key]) for key in found)
@@ -359,7 +349,7 @@ def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch)
     model.replay_buffer.rewards[:] = 0.0
     model.train(gradient_steps=2, batch_size=8)
     model.dump_logs()
-    assert model._resets == [40] and all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert model._resets.done == [40] and all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
 def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
@@ -476,4 +466,4 @@ def test_filters_of_ones_own():
 def test_no_warning_of_greed_where_resets_explore():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make_rainbow(ChainEnv(), reset_interval=100, policy_kwargs={"noisy": False})
+        make_rainbow(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})

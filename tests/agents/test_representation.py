@@ -124,11 +124,15 @@ def test_actions_that_do_not_depend_on_the_state():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"aet_loss": "contrastive"},
+        {"policy_kwargs": {"aet_loss": "contrastive"}},
         {"policy_kwargs": {"projection": "none"}},
         {"policy_kwargs": {"whiten": True}},
         {"policy_kwargs": {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}},
-        {"policy_kwargs": {"state_dependent_actions": False}, "aet_loss": "contrastive", "td_coef": 0.0, "symmetry_coef": 0.0},
+        {
+            "policy_kwargs": {"state_dependent_actions": False, "aet_loss": "contrastive"},
+            "td_coef": 0.0,
+            "symmetry_coef": 0.0,
+        },
         {"td_coef": 0.0, "aet_coef": 0.0},
     ],
     ids=str,
@@ -137,7 +141,7 @@ def test_the_switches_train_and_are_saved(make, settings, tmp_path):
     model = make(ChainEnv(), **settings).learn(60)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
-    assert loaded.aet_loss == model.aet_loss and loaded.td_coef == model.td_coef
+    assert loaded.policy.aet_loss == model.policy.aet_loss and loaded.td_coef == model.td_coef
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
     loaded.learn(60)
@@ -145,7 +149,7 @@ def test_the_switches_train_and_are_saved(make, settings, tmp_path):
 
 def test_what_is_not_legal():
     with pytest.raises(ValueError, match=r"aet_loss: expected one of .*contrastive.*found 'nce'"):
-        EqRQRDQN("MlpPolicy", ChainEnv(), aet_loss="nce")
+        EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"aet_loss": "nce"})
     with pytest.raises(ValueError, match=r"projection: expected one of .*found 'mine'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "mine"})
     with pytest.raises(ValueError, match="td_coef: expected a finite number of at least 0"):

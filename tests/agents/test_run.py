@@ -53,7 +53,7 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
         {"train_freq": (1, "episode")},
         {"n_steps": 1},
         {"n_steps": 10, "prediction_depth": 0},
-        {"reward_loss": "categorical"},
+        {"policy_kwargs": {"reward_loss": "categorical"}},
         {"symmetry_coef": 0, "reward_coef": 0},
         {"aet_coef": 0, "symmetry_coef": 0},
         {"aet_coef": 0, "reward_coef": 0},
@@ -125,7 +125,8 @@ def test_defaults_are_those_of_table_5(make):
     assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
     assert (model.learning_starts, model.gradient_steps, model.n_steps, model.prediction_depth) == (2000, 2, 10, 5)
     assert (model.train_freq.frequency, model.train_freq.unit.value, model.tau) == (1, "step", 1.0)
-    assert (model.priority_alpha, model.priority_beta) == (0.5, 0.4)
+    buffer = model.replay_buffer
+    assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.4, 1.0)
     assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
     assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (1, 1, 1)
     assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
@@ -167,7 +168,7 @@ def test_group_keywords_reach_a_given_group_encoder(make):
 def test_images_that_are_floats_already(make):
     env = ImageEnv((3, 40, 36), dtype=np.float32)
     model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(60)
-    assert model._augment.image_keys == [""]  # augmented like the others
+    assert model.objective.augment.image_keys == [""]  # augmented like the others
     policy_kwargs = {"normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
     encoder = make(env, "CnnPolicy", policy_kwargs=policy_kwargs).policy.online.features_extractor
     assert isinstance(encoder.trunk, ConvExtractor)
@@ -207,7 +208,7 @@ def test_a_custom_extractor_becomes_the_trunk(make):
     encoder = model.policy.online.features_extractor
     assert isinstance(encoder, GroupFeaturesExtractor) and isinstance(encoder.trunk, TinyExtractor)
     assert encoder.to_algebra.in_features == 7
-    assert not model._target_is_online  # batch norm: online features in train mode are no target features
+    assert not model.policy.target_encodes_as_online  # batch norm: online features in train mode are no target features
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(60)
     assert model.policy.online.features_extractor.to_algebra.in_features == 512
 
@@ -257,10 +258,10 @@ def test_multi_discrete_and_multi_binary_observations(make, space):
 
 def test_dict_observations_are_augmented_where_they_are_images(make):
     model = make(SimpleMultiObsEnv(channel_last=True), "MultiInputPolicy")
-    assert model._augment.image_keys == ["img"]
+    assert model.objective.augment.image_keys == ["img"]
     model.learn(60)
     obs = {"img": th.randint(0, 256, (4, 1, 36, 36), dtype=th.uint8), "vec": th.rand(4, 5)}
-    augmented = model._augment(obs)
+    augmented = model.objective.augment(obs)
     assert th.equal(augmented["vec"], obs["vec"]) and not th.allclose(augmented["img"] * 255, obs["img"].float(), atol=0.5)
     with pytest.raises(ValueError, match="MultiInputPolicy"):
         make(SimpleMultiObsEnv(), "MlpPolicy")
@@ -350,7 +351,7 @@ def test_exploration_is_random_then_noisy_and_prediction_is_neither(make):
 
 
 def test_beta_and_counters(make):
-    model = make(ChainEnv(), train_freq=1, gradient_steps=3, learning_starts=50, priority_beta=0.4)
+    model = make(ChainEnv(), train_freq=1, gradient_steps=3, learning_starts=50, replay_buffer_kwargs={"beta": 0.4})
     model.learn(100)
     assert model._n_updates == 3 * 50
     # The last update was made when all steps were done, so β has reached 1.
@@ -412,7 +413,7 @@ def test_vec_normalize(make):
     model = make(env).learn(100)
     samples = model.replay_buffer.sample(50, env=env)
     store = model.replay_buffer._stores[""]
-    raw = store.observations(store.ids(*np.divmod(samples.indices, 2)))
+    raw = store.observations(*np.divmod(samples.indices, 2), following=False)
     np.testing.assert_allclose(samples.observations, env.normalize_obs(raw), rtol=1e-6)
     assert samples.rollout_rewards.abs().max() <= env.clip_reward
     model.learn(20, reset_num_timesteps=False)
@@ -475,11 +476,11 @@ def test_logged_figures_are_means_over_the_updates_since_the_last_dump(make):
         model._monitor.start_round(0)
         for value in values:
             model._monitor.add({"loss": th.tensor(value), "grad_norm": th.tensor(value + 1)})
-        model._collect_metrics()
+        model._log_last_round()
     logged = model.logger.name_to_value
     assert (logged["train/loss"], logged["train/grad_norm"]) == (4.0, 5.0)
     model.logger.dump()
-    model._collect_metrics()
+    model._log_last_round()
     assert not any("train/" in key for key in model.logger.name_to_value)
 
 

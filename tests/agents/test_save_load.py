@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
-from tests.models import EITHER, MAKERS
+from tests.models import EITHER, MAKERS, loss_terms
 from tests.resume import Save, make_env
 from tests.toys import ChainEnv, ImageEnv
 
@@ -95,7 +95,7 @@ def test_switches_can_be_changed_on_loading(make, tmp_path):
         make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
     make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
     richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)
-    assert richer._compute_losses(richer.replay_buffer.sample(8))[1].aet.shape == (8,)
+    assert loss_terms(richer, richer.replay_buffer.sample(8)).aet.shape == (8,)
 
 
 def test_another_seed_may_be_given_on_loading(make, tmp_path):
@@ -109,12 +109,12 @@ def test_another_seed_may_be_given_on_loading(make, tmp_path):
 
 def test_a_target_that_is_no_copy_is_not_taken_for_one(make, tmp_path):
     model = make(ChainEnv(), tau=0.005).learn(60)
-    assert not model._target_is_online
+    assert not model.policy.target_encodes_as_online
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), tau=1.0)
-    assert not loaded._target_is_online
+    assert not loaded.policy.target_encodes_as_online
     loaded.learn(60)
-    assert loaded._target_is_online
+    assert loaded.policy.target_encodes_as_online
 
 
 def test_set_env_and_other_numbers_of_environments(make, tmp_path):
@@ -190,10 +190,7 @@ def test_replay_buffer_goes_with_the_model(make, tmp_path):
 
 
 KNOBS = {  # two resets after the file is written, one before; n and γ on their way
-    "reset_interval": 50,
-    "initial_n_steps": 6,
-    "initial_gamma": 0.9,
-    "annealing_steps": 70,
+    "resets": {"interval": 50, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 70},
     "tau": 0.05,
     "policy_kwargs": {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}},
 }
@@ -213,8 +210,8 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, 
     continued = make.algorithm.load(tmp_path / "continued", device="cpu")
     halfway = make.algorithm.load(tmp_path / "model", device="cpu")
     assert continued.num_timesteps == 240 and continued._n_updates == model._n_updates
-    assert continued._resets == model._resets == ([50, 100, 150] if knobs else [])
-    assert halfway._resets == model._resets[:1]
+    assert continued._resets.done == model._resets.done == ([50, 100, 150] if knobs else [])
+    assert halfway._resets.done == model._resets.done[:1]
     assert equal_states(model.policy.state_dict(), continued.policy.state_dict())
     assert not equal_states(model.policy.state_dict(), halfway.policy.state_dict())
     a, b = model.policy.optimizer.state_dict()["state"], continued.policy.optimizer.state_dict()["state"]
@@ -242,7 +239,7 @@ def test_parameters_for_another_support(tmp_path):
     model = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs)
     model.save(tmp_path / "model")
     other = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs, policy_kwargs={"v_max": 100.0})
-    with pytest.raises(ValueError, match=r"expected parameters for .*\[-10.0, 100.0\], found parameters for \[-10.0, 10.0\]"):
+    with pytest.raises(ValueError, match=r"support: expected .* '\[-10.0, 100.0\]', found parameters for '\[-10.0, 10.0\]'"):
         other.set_parameters(str(tmp_path / "model"))
     other.save(tmp_path / "other")
     loaded = EqRRainbow.load(tmp_path / "other")
@@ -257,11 +254,13 @@ def test_parameters_of_another_group(make, tmp_path):
     model.save(tmp_path / "model")
     for wrong in (other, twisted):
         before = {name: p.clone() for name, p in wrong.policy.state_dict().items()}
-        with pytest.raises(ValueError, match=r"expected parameters of .*, found parameters of 'SE\(2\)\^4, euler'"):
+        with pytest.raises(ValueError, match=r"group: expected parameters for .*, found parameters for 'SE\(2\)\^4, euler'"):
             wrong.set_parameters(str(tmp_path / "model"))
         assert equal_states(before, wrong.policy.state_dict())
     with pytest.raises(ValueError, match="policy kwargs"):
         make.algorithm.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
+    with pytest.raises(ValueError, match="found parameters for 'SE"):
+        make.algorithm.load(tmp_path / "model", custom_objects={"policy_kwargs": other.policy_kwargs})
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
@@ -290,7 +289,7 @@ def test_replay_buffers_of_others(make, tmp_path):
         with pytest.raises(ValueError, match="expected a replay buffer of"):
             model.load_replay_buffer(tmp_path / name)
         assert model.replay_buffer.size() == 60
-    for other in ({"prioritized_replay": False}, {"priority_alpha": 0.9}):
+    for other in ({"prioritized_replay": False}, {"replay_buffer_kwargs": {"alpha": 0.9}}):
         make(ChainEnv(), **other).save_replay_buffer(tmp_path / "other")
         with pytest.raises(ValueError, match="expected a replay buffer of"):
             model.load_replay_buffer(tmp_path / "other")

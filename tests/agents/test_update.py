@@ -5,8 +5,8 @@ import pytest
 import torch as th
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
-from sb3_eqr.common import eqr_algorithm, preprocessing
-from tests.models import MAKERS
+from sb3_eqr.common import objective
+from tests.models import MAKERS, loss_terms, train_on
 from tests.toys import ChainEnv, ImageEnv
 
 
@@ -23,7 +23,7 @@ def test_quantile_td_loss_by_loops(double_q, dueling):
     model.policy.set_training_mode(False)
     samples = model.replay_buffer.sample(16)
     with th.no_grad():
-        td, _ = model._compute_losses(samples)
+        td = loss_terms(model, samples)
         now = model.policy.online(samples.observations).double().numpy()  # (16, 9, 3)
         online = model.policy.online(samples.next_observations).double().numpy()
         target = model.policy.target(samples.next_observations).double().numpy()
@@ -41,9 +41,9 @@ def test_quantile_td_loss_by_loops(double_q, dueling):
                 u = goal[j] - current[i]
                 huber = 0.5 * u * u if abs(u) <= 1 else abs(u) - 0.5
                 expected += abs((i + 0.5) / 9 - (u < 0)) * huber / 9
-        assert td.loss[b].item() == pytest.approx(expected, rel=1e-4)
+        assert td.td[b].item() == pytest.approx(expected, rel=1e-4)
         assert td.q_values[b].item() == pytest.approx(current.mean(), rel=1e-4, abs=1e-6)
-    assert th.equal(td.priorities, td.loss)
+    assert th.equal(td.priorities, td.td)
 
 
 @pytest.mark.parametrize("double_q", [True, False])
@@ -58,7 +58,7 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
             parameter.neg_()
     samples = model.replay_buffer.sample(16)
     with th.no_grad():
-        td, _ = model._compute_losses(samples)
+        td = loss_terms(model, samples)
         now, online = (model.q_net.log_probs(o).double().numpy() for o in (samples.observations, samples.next_observations))
         target = model.q_net_target.log_probs(samples.next_observations).double().numpy()  # (16, 9, 3)
     support = [-1.0 + 3.0 * i / 8 for i in range(9)]
@@ -77,7 +77,7 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
         current = now[b, :, samples.actions[b, 0].item()]
         cross_entropy = -sum(goal * current)
         divergence = sum(g * (np.log(g) - c) for g, c in zip(goal, current, strict=True) if g > 0)
-        assert td.loss[b].item() == pytest.approx(cross_entropy, rel=1e-5)
+        assert td.td[b].item() == pytest.approx(cross_entropy, rel=1e-5)
         assert td.priorities[b].item() == pytest.approx(max(divergence, 0), rel=1e-4, abs=2e-6)
         assert td.q_values[b].item() == pytest.approx(np.exp(current) @ support, rel=1e-5, abs=1e-6)
 
@@ -91,7 +91,7 @@ def test_target_states_reach_the_latent_model_in_order(make, monkeypatch):
     monkeypatch.setattr(
         type(model.policy.latent_model), "forward", lambda self, *args: seen.update(args=args) or forward(self, *args)
     )
-    model._compute_losses(samples)
+    loss_terms(model, samples)
     state, actions, rewards, mask, target_states = seen["args"][:5]
     th.testing.assert_close(state, model.policy.online.features(samples.observations))
     assert actions is samples.rollout_actions and rewards is samples.rollout_rewards and mask is samples.mask
@@ -110,7 +110,7 @@ def test_replay_weights_multiply_every_loss(make):
 
     def gradients(weights):
         th.manual_seed(0)
-        model._update(samples._replace(weights=weights))
+        train_on(model, samples._replace(weights=weights))
         return [p.grad.clone() for p in model._trained]
 
     states = {name: p.clone() for name, p in model.policy.state_dict().items()}
@@ -126,11 +126,11 @@ def test_replay_weights_multiply_every_loss(make):
 
 
 def test_new_priorities_are_those_of_the_td_loss(make):
-    model = trained_model(make, priority_alpha=0.5)
+    model = trained_model(make, replay_buffer_kwargs={"alpha": 0.5})
     samples = model.replay_buffer.sample(8)
     with th.no_grad():
-        td, _ = model._compute_losses(samples)
-    model._update(samples)
+        td = loss_terms(model, samples)
+    train_on(model, samples)
     found = model.replay_buffer._tree.get(samples.indices)
     last = {int(i): b for b, i in enumerate(samples.indices)}  # of a leaf drawn twice, the last counts
     for index, b in last.items():
@@ -140,7 +140,7 @@ def test_new_priorities_are_those_of_the_td_loss(make):
 
 def test_gradients_are_clipped_together(make):
     model = trained_model(make, max_grad_norm=0.01)
-    model._update(model.replay_buffer.sample(8))
+    train_on(model, model.replay_buffer.sample(8))
     norm = th.stack([p.grad.norm() for p in model._trained]).norm().item()
     assert norm == pytest.approx(0.01, rel=1e-3)
     trained = {id(p) for p in model._trained}
@@ -166,10 +166,12 @@ def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size
     model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(60)
     samples, losses = model.replay_buffer.sample(8), []
     for at_a_time, n_pieces in ((1, 8), (3 * size, 3), (10**9, 1)):
-        monkeypatch.setattr(eqr_algorithm, "_PIECE", at_a_time)
-        assert len(model._pieces(samples.next_observations)) == n_pieces
+        monkeypatch.setattr(objective, "_PIECE", at_a_time)
+        observations = samples.next_observations
+        as_dict = observations if isinstance(observations, dict) else {"": observations}
+        assert len(objective.in_pieces(as_dict)) == n_pieces
         th.manual_seed(0)
-        losses.append(model._compute_losses(samples)[1].aet)
+        losses.append(loss_terms(model, samples).aet)
     th.testing.assert_close(losses[0], losses[2])
     th.testing.assert_close(losses[1], losses[2])
 
@@ -177,8 +179,8 @@ def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size
 def test_online_and_target_observations_are_augmented(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(60)
     seen = []
-    shift = preprocessing.random_shift
-    monkeypatch.setattr(preprocessing, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))
+    shift = objective.random_shift
+    monkeypatch.setattr(objective, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))
     model.train(1, 8)
     assert seen == [8, 8, 16]
 
@@ -187,7 +189,7 @@ def test_online_and_target_observations_are_augmented(make, monkeypatch):
 def test_augmentation_switches(make, off):
     model = make(ImageEnv(), "CnnPolicy", **off)
     images = th.randint(1, 256, (16, 1, 36, 36), dtype=th.uint8)
-    found = model._augment(images) * 255  # what the networks see is in [0, 1]
+    found = model.objective.augment(images) * 255  # what the networks see is in [0, 1]
     moved = not all(th.equal((f > 0), (i > 0)) for f, i in zip(found, images, strict=True))
     assert not moved  # every pixel is above 0 before and after
     integral = th.allclose(found, found.round(), atol=1e-4, rtol=0)

@@ -1,0 +1,139 @@
+"""What people do with any SB3 model: copy it, average its parameters, misspell its arguments, bring an extractor."""
+
+import inspect
+import pickle
+from copy import deepcopy
+
+import cloudpickle
+import pytest
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+
+from sb3_eqr import GroupFeaturesExtractor
+from tests.models import EITHER, MAKERS
+from tests.toys import ChainEnv, ImageEnv
+
+
+def continued(model):
+    """The same model, wherever its environment and the random generators were: some more updates on what is stored."""
+    th.manual_seed(0)
+    model.replay_buffer._tree.set(th.arange(40).numpy(), 1.0)
+    model.set_random_seed(0)
+    model.train(5, 8)
+    return list(model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    "copied", [deepcopy, lambda m: pickle.loads(pickle.dumps(m)), lambda m: cloudpickle.loads(cloudpickle.dumps(m))]
+)
+def test_a_model_can_be_copied_while_it_trains(make, copied):
+    model = make(ChainEnv(), policy_kwargs={"projection": "own", "aet_loss": "contrastive"}).learn(60)
+    copy = copied(model)
+    before = [p.clone() for p in copy.policy.parameters()]
+    ours = continued(model)
+    assert all(th.equal(a, b) for a, b in zip(before, copy.policy.parameters(), strict=True))  # no tensor is shared
+    theirs = continued(copy)
+    for a, b in zip(ours, theirs, strict=True):  # memory that pickle returns is aligned otherwise, and sums round otherwise
+        th.testing.assert_close(a, b, rtol=0, atol=2e-4)
+    assert any(not th.equal(a, b) for a, b in zip(before, theirs, strict=True))
+
+
+@pytest.mark.parametrize("policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv)])
+def test_state_dicts_are_floats_and_counters(make, policy, env):
+    """As sb3-contrib's tests of random parameters and of averaging ask."""
+    model, other = (make(env(), policy, policy_kwargs={"whiten": True}, seed=seed) for seed in (0, 1))
+    state = model.policy.state_dict()
+    counters = {name for name, value in state.items() if not value.is_floating_point()}
+    assert all(name.endswith("num_batches_tracked") for name in counters)
+    assert all(value.dtype == th.float32 for name, value in state.items() if name not in counters)
+    mean = {name: (value + other.policy.state_dict()[name]) / 2 for name, value in state.items()}
+    model.policy.load_state_dict(mean)
+    model.policy.load_state_dict({name: th.rand_like(value.float()) for name, value in state.items()})
+    model.set_parameters({"policy": {name: th.rand_like(v.float()) for name, v in state.items()}}, exact_match=False)
+    assert model.predict(model.get_env().reset())[0].shape == (1,)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (
+            {"prediction_dpeth": 3},
+            r"^EqR(QRDQN|Rainbow) got an unexpected argument 'prediction_dpeth'. Did you mean 'prediction_depth'\?",
+        ),
+        ({"bogus": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'bogus'. It takes policy, env, learning_rate,.*seed"),
+        (
+            {"policy_kwargs": {"n_block": 3}},
+            r"^policy_kwargs: EqR.*Policy got an unexpected .*'n_block'. Did you mean 'n_blocks'\?",
+        ),
+        (
+            {"replay_buffer_kwargs": {"alhpa": 3}},
+            r"^replay_buffer_kwargs: PrioritizedSequenceReplayBuffer got .* 'alhpa'. Did you mean 'alpha'\?",
+        ),
+        ({"prioritized_replay": False, "replay_buffer_kwargs": {"alpha": 0.7}}, "SequenceReplayBuffer got .* 'alpha'"),
+    ],
+)
+def test_misspelt_arguments(make, kwargs, message):
+    with pytest.raises(TypeError, match=message):
+        make(ChainEnv(), **kwargs)
+
+
+def test_the_signature_is_that_of_the_constructor(make):
+    parameters = inspect.signature(make.algorithm).parameters
+    assert len(parameters) <= 38 and list(parameters)[:3] == ["policy", "env", "learning_rate"]
+    assert not any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    assert not any(name.startswith(("get_", "set_")) for name in parameters)
+
+
+def trunk_of(model):
+    return model.policy.online.features_extractor.trunk
+
+
+@EITHER
+@pytest.mark.parametrize("name", ["nature", "impala"])
+def test_our_extractors_take_features_dim(make, name):
+    network = {"features_extractor_class": name, "features_extractor_kwargs": {"features_dim": 24}}
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(50)
+    assert model.policy.online.features_extractor.to_algebra.in_features == 24
+    features = trunk_of(model)(th.rand(2, 1, 36, 36))
+    assert features.shape == (2, 24) and (features >= 0).all()  # a ReLU, as in SB3's NatureCNN
+    assert trunk_of(make(ImageEnv(), "CnnPolicy")).linear is None
+    with pytest.raises(ValueError, match="features_dim"):
+        make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_kwargs": {"features_dim": 0}})
+
+
+def test_the_group_encoder_hands_features_dim_to_its_trunk():
+    encoder = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, n_blocks=2, features_dim=24)
+    assert encoder.to_algebra.in_features == 24 and encoder.features_dim == 18
+    nature = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, trunk_class=NatureCNN, features_dim=24)
+    assert nature.trunk.features_dim == 24
+
+
+class Own(BaseFeaturesExtractor):
+    def __init__(self, observation_space, features_dim=8):
+        super().__init__(observation_space, features_dim)
+        self.layer = th.nn.Sequential(th.nn.Flatten(), th.nn.Linear(3, features_dim))
+
+    def forward(self, observations):
+        return self.layer(observations)
+
+
+def test_a_custom_extractor_takes_features_dim():
+    network = {"features_extractor_class": Own, "features_extractor_kwargs": {"features_dim": 5}}
+    model = MAKERS[0](ChainEnv(), policy_kwargs=network)
+    assert isinstance(trunk_of(model), Own) and trunk_of(model).features_dim == 5
+
+
+def test_old_import_paths():
+    import sb3_eqr
+    from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+    from sb3_eqr.common.features_extractor import GroupFeaturesExtractor as encoder
+    from sb3_eqr.common.groups import MatrixLieGroup, make_group
+
+    for name, found in {
+        "PrioritizedSequenceReplayBuffer": PrioritizedSequenceReplayBuffer,
+        "SequenceReplayBuffer": SequenceReplayBuffer,
+        "GroupFeaturesExtractor": encoder,
+        "MatrixLieGroup": MatrixLieGroup,
+        "make_group": make_group,
+    }.items():
+        assert getattr(sb3_eqr, name) is found
