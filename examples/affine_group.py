@@ -3,7 +3,7 @@ Your own group: the affine group of the plane, given by its six generators, lear
 
     python examples/affine_group.py          # two minutes
 
-Leaves model.zip, actions.csv and affine_group.png in --out: what each action does to a square, and where the states lie.
+Writes model.zip, actions.csv and affine_group.png to --out: what each action does to a square, and the latent states.
 """
 
 import argparse

@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--states", type=int, nargs="+", default=[6, 8, 10])
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--json", metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--json", metavar="FILE", help="write the counts to this file, too")
     args = parser.parse_args()
     th.set_num_threads(1)
     results = []

@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--agent", choices=STEPS_OF, default="eqr_qrdqn")
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--json", metavar="FILE", help="append one line of figures per seed")
+    parser.add_argument("--json", metavar="FILE", help="append one line of metrics per seed")
     args = parser.parse_args()
     th.set_num_threads(1)
     for seed in args.seeds:

@@ -1,13 +1,13 @@
 """
-An EqR agent on one Atari game, from training to a picture and a video of what it sees and predicts.
+An EqR agent on one Atari game, from training to a plot and a video of what it observes and predicts.
 
     python examples/demo.py --game Pong                       # EqRQRDQN, as many steps as fit into --minutes
-    python examples/demo.py --game Boxing --steps 100000      # the real thing
+    python examples/demo.py --game Boxing --steps 100000      # the full benchmark
     python examples/demo.py --config eqr_rainbow --steps 3000
     python examples/demo.py --config eqr_bbf --width-scale 1 --steps 3000    # narrow enough for two cores
 
-Leaves model.zip, progress.csv, training.png, latents.mp4 and latents.gif in --out. The video has the game at the left and the
-blocks of the agent's latent state at the right: now, and as its latent model predicted them five steps before.
+Writes model.zip, progress.csv, training.png, latents.mp4 and latents.gif to --out. The video shows the game on the left, the
+blocks of the agent's latent state on the right: now, and as its latent model predicted them five steps before.
 """
 
 import argparse
@@ -48,13 +48,13 @@ SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Ta
 
 
 class Demo(BaseCallback):
-    """Writes a row of figures every so many steps, keeps the score of every game, stops when the time is over."""
+    """Writes a row of metrics every so many steps, keeps the score of every game, stops when the time is over."""
 
     def __init__(self, log_every: int, seconds: float | None):
         super().__init__()
         self.log_every = log_every
         self.deadline = None if seconds is None else time.monotonic() + seconds
-        self.scores: list[tuple[int, float]] = []  # (step, raw score of a whole game)
+        self.scores: list[tuple[int, float]] = []  # (step, raw score of a full game)
 
     def _on_training_end(self) -> None:
         if self.deadline is not None and time.monotonic() >= self.deadline:
@@ -100,7 +100,7 @@ def draw(
     title: str,
     path: pathlib.Path,
 ) -> None:
-    """One picture: the score of every game, the evaluation at the end, and the four losses over steps."""
+    """One figure: the score of every game, the evaluation at the end, and the four losses over steps."""
     figure, axes = plt.subplots(5, 1, figsize=(7, 11), sharex=True, layout="constrained")
     figure.suptitle(title)
     steps, raw = np.array(scores).reshape(-1, 2).T

@@ -1,5 +1,5 @@
 """
-Example 1 of the paper: does ρ negate the torque of a pendulum without gravity when the world is mirrored?
+Example 1 of the paper: does ρ negate the torque of a pendulum without gravity when the environment is mirrored?
 
     python examples/pendulum_reflection.py --seeds 0 1      # the table of docs/representation.md, some minutes per group
 
@@ -27,7 +27,7 @@ GROUPS = {"SO(2)": 4, "SE(2)": 4, "GL(2)": 4}
 N_STATES = 512
 
 
-def pictures(world: PixelPendulum, angles: np.ndarray, velocities: np.ndarray) -> th.Tensor:
+def images(world: PixelPendulum, angles: np.ndarray, velocities: np.ndarray) -> th.Tensor:
     """
     :return: (N, 2, size, size), uint8
     """
@@ -39,8 +39,8 @@ def measure(model: EqRQRDQN, world: PixelPendulum, seed: int) -> dict[str, Any]:
     """Where ρ(τ_g) κ(s, a) moves the mirrored state, beside where the torques do."""
     rng = np.random.default_rng(seed)
     angles, velocities = rng.uniform(-np.pi, np.pi, N_STATES), rng.uniform(-4, 4, N_STATES)
-    x = encode(model, pictures(world, angles, velocities))  # (N, D)
-    mirrored = encode(model, pictures(world, -angles, -velocities))
+    x = encode(model, images(world, angles, velocities))  # (N, D)
+    mirrored = encode(model, images(world, -angles, -velocities))
     latent_model, group = model.policy.latent_model.eval(), model.policy.latent_model.group
     clockwise, other = th.eye(latent_model.n_actions)[[0, -1]][:, None].expand(-1, N_STATES, -1)  # opposite torques
     with th.no_grad():

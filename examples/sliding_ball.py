@@ -1,11 +1,11 @@
 """
-Example 2 and Figure 3 of the paper: the latent space of a sliding ball, learned from random play without reward.
+Example 2 and Figure 3 of the paper: the latent space of a sliding ball, learned from random actions without reward.
 
     python examples/sliding_ball.py                                  # the ball, SO(2), one seed: two minutes
     python examples/sliding_ball.py --seeds 0 1 2 3 4 --arms each    # the table of docs/representation.md
     python examples/sliding_ball.py --world torus                    # a torus, two blocks
 
-Leaves a model and a picture per run and results.jsonl (a line per run; what is in there is not run again) in --out.
+Writes a model and a figure per run and results.jsonl (a line per run; runs that are in it are not repeated) to --out.
 """
 
 import argparse
@@ -53,7 +53,7 @@ N_ENVS = 16  # at once: random play of one alone sees little of a torus
 WIDTH = 0.25  # of the ball, in loops
 
 
-def pictures(world: SlidingBall, positions: np.ndarray) -> th.Tensor:
+def images(world: SlidingBall, positions: np.ndarray) -> th.Tensor:
     """
     :param positions: (N, axes)
     :return: (N, 1, size, size), uint8
@@ -110,10 +110,10 @@ def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n
     moved = ((2 * forwards - 1)[..., None] * np.eye(world.dimensions)[axis]).sum(axis=1)  # (n, axes), in steps
     latent_model = model.policy.latent_model
     with th.no_grad():
-        states = encode(model, pictures(world, starts))
+        states = encode(model, images(world, starts))
         steps = one_hot(th.as_tensor(actions), latent_model.n_actions).float()
         predicted = latent_model.rollout(states, steps, th.ones(actions.shape))[:, -1]  # (n, D)
-    nearest = th.cdist(predicted, encode(model, pictures(world, places))).argmin(dim=1).numpy()
+    nearest = th.cdist(predicted, encode(model, images(world, places))).argmin(dim=1).numpy()
     apart = (places[nearest] - starts - moved / world.n_steps + 0.5) % 1 - 0.5
     return np.linalg.norm(apart, axis=1) / WIDTH
 
@@ -121,7 +121,7 @@ def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n
 def measure(model: EqRQRDQN, world: SlidingBall, per_axis: int) -> dict[str, Any]:
     """What was learned, in numbers. Angles of actions are in steps of the ball."""
     places = grid(world.dimensions, per_axis)
-    states = encode(model, pictures(world, places))
+    states = encode(model, images(world, places))
     angles = turns(model, states)  # (N, K)
     fits = [linearity(angles[:, k], places) for k in range(angles.shape[1])]
     elements = action_elements(model, states[:: max(len(states) // 64, 1)])
@@ -150,9 +150,9 @@ def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) ->
         along = np.full((GRID["ball"], axes), 0.5)
         along[:, axis] = np.arange(GRID["ball"]) / GRID["ball"]
         every = along[:: GRID["ball"] // 8]  # eight positions
-        angles = 2 * np.pi * turns(model, encode(model, pictures(world, along)))
-        eight = 2 * np.pi * turns(model, encode(model, pictures(world, every)))
-        shown = np.pad(pictures(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
+        angles = 2 * np.pi * turns(model, encode(model, images(world, along)))
+        eight = 2 * np.pi * turns(model, encode(model, images(world, every)))
+        shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
         panels[axis, 0].imshow(np.block([list(shown[:4]), list(shown[4:])]), cmap="gray")
         panels[axis, 0].set_title("positions 0 to 3, 4 to 7", fontsize="small")
         panels[axis, 0].set_axis_off()

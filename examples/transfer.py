@@ -1,10 +1,10 @@
 """
-Does a representation help another task? A ball on a torus, two goals: what moves is the same, what is rewarded is not.
+Does a representation help another task? A ball on a torus, two goals: the dynamics are the same, the rewards are not.
 
     python examples/transfer.py --seeds 0 1 2 3 4      # the table of docs/transfer.md: an hour on one thread
 
 Per seed, an agent learns goal A; agents for goal B start from scratch, from A's representation (frozen, too), and
-from one that was learned without any goal. Leaves models, evaluations and results.jsonl in --out; finished runs are not
+from one that was learned without any goal. Writes models, evaluations and results.jsonl to --out; finished runs are not
 repeated.
 """
 
