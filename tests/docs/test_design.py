@@ -1,0 +1,46 @@
+"""docs/design.md names files and code that exist, and every module of ``sb3_eqr.common``."""
+
+import ast
+import pathlib
+import re
+
+ROOT = pathlib.Path(__file__).parents[2]
+PACKAGE = ROOT / "sb3_eqr"
+PAGE = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+
+
+def section(title):
+    return PAGE.split(f"## {title}\n")[1].split("\n## ")[0]
+
+
+def defined(node, prefix=""):
+    """Dotted names of classes, functions, and what is assigned or annotated in modules and classes."""
+    for child in node.body:
+        if isinstance(child, (ast.ClassDef, ast.FunctionDef)):
+            yield prefix + child.name
+        if isinstance(child, ast.ClassDef):
+            yield from defined(child, f"{child.name}.")
+        if isinstance(child, (ast.Assign, ast.AnnAssign)):
+            for target in child.targets if isinstance(child, ast.Assign) else [child.target]:
+                yield prefix + ast.unparse(target)
+
+
+def test_every_module_has_a_line_in_the_tree():
+    first_cells = re.findall(r"^\| (`[^|]+) \|", section("The tree").split("|---|")[1], re.M)
+    listed = [name for cell in first_cells for name in re.findall(r"`([^`]+)`", cell)]
+    modules = [path.relative_to(PACKAGE / "common").as_posix() for path in (PACKAGE / "common").rglob("*.py")]
+    assert sorted(listed) == sorted(name for name in modules if not name.endswith("__init__.py"))
+
+
+def test_what_the_page_names_is_there():
+    sources = [path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")]
+    names = {name for source in sources for name in defined(ast.parse(source))}
+    words = {word for source in sources for word in re.findall(r"\w+", source)}
+    for span in re.findall(r"`([^`\n]+)`", section("The tree") + section("Where to change what")):
+        name = span.strip("/")
+        if re.search(r"/|\.(py|yml|toml)$", span):
+            assert any(list(folder.glob(name)) for folder in (ROOT, PACKAGE, PACKAGE / "common")), span
+        elif re.fullmatch(r"[A-Z]\w*(\.\w+)?", name):
+            assert name in names, span
+        elif re.fullmatch(r"\w+", name):
+            assert name in words, span
