@@ -16,7 +16,7 @@ from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.envs import make_atari100k_env
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", ["atari", "CartPole-v1"])

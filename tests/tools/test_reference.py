@@ -1,7 +1,6 @@
 """The bundled figures give the last rows that the paper prints."""
 
 import json
-import pathlib
 
 import pytest
 
@@ -14,6 +13,7 @@ from sb3_eqr.benchmark.reference import (
     published_table,
     read_runs,
 )
+from tests.tools.test_package import ROOT
 
 # mean, median, games above human, as printed under Tables 2, 3 and 4
 PRINTED = {
@@ -81,7 +81,7 @@ def test_the_last_rows_are_printed_ones_but_for_two():
 
 
 def test_the_page_of_last_rows_is_up_to_date():
-    page = pathlib.Path(__file__).parent.parent / "docs" / "results" / "published.md"
+    page = ROOT / "docs" / "results" / "published.md"
     assert page.read_text(encoding="utf-8") == published_table() + "\n"
 
 

@@ -64,23 +64,35 @@ def test_the_detectable_difference_is_what_resampling_whole_experiments_gives():
     """One game without tails to trim: the IQM of n runs varies as 25 %-trimmed means of n draws do."""
     rng = np.random.default_rng(1)
     first, second = rng.normal(0, 1.0, (400, 1)), rng.normal(0, 2.0, (400, 1))
-    drawn = rng.normal(0, 1.0, (4_000, 400))
+    drawn = rng.normal(0, 1.0, (1_000, 400))
     spread = np.sort(drawn, axis=1)[:, 100:300].mean(axis=1).std()  # of an IQM of 400 runs, sd 1
-    assert detectable_difference(first, second) == pytest.approx(1.96 * spread * np.sqrt(1 + 4), rel=0.15)
+    assert detectable_difference(first, second, 500) == pytest.approx(1.96 * spread * np.sqrt(1 + 4), rel=0.15)
     with pytest.raises(ValueError, match="two runs or more of each agent, found 1"):
         detectable_difference(first[:1], second)
 
 
-@pytest.mark.parametrize("n_runs, n_games", [(2, 1), (3, 3), (5, 3)])
-def test_agents_that_are_alike_are_seldom_told_apart(n_runs, n_games):
-    """At most one time in twenty, within three standard deviations of 200 trials."""
+@pytest.mark.parametrize("n_runs", [2, 3])
+def test_the_detectable_difference_of_few_runs_is_that_of_a_t_test(n_runs):
+    """Of three runs on one game the IQM leaves none out: it is their mean."""
+    first, second = np.random.default_rng(0).normal(0, [[1.0], [2.0]], (2, n_runs))
+    standard_error = np.sqrt((first.var(ddof=1) + second.var(ddof=1)) / n_runs)
+    critical = {2: 4.303, 3: 2.776}[n_runs]  # Student's t, 2 (n - 1) degrees of freedom, 97.5 %
+    found = detectable_difference(first[:, None], second[:, None], 500)
+    assert found == pytest.approx(critical * standard_error, rel=0.1)  # three standard deviations of the bootstrap
+
+
+def test_agents_that_are_alike_are_seldom_told_apart():
+    """
+    At most one time in twenty, within three standard deviations of 100 trials: 11 of them. With the bootstrap's own variance
+    and a normal quantile it would be a fifth of them.
+    """
     rng = np.random.default_rng(0)
-    means = rng.normal(size=n_games)
+    means = rng.normal(size=3)
     apart = 0
-    for _ in range(200):
-        first, second = rng.normal(means, 1, (2, n_runs, n_games))
-        apart += abs(metrics.aggregate_iqm(first) - metrics.aggregate_iqm(second)) > detectable_difference(first, second, 50)
-    assert apart / 200 < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 200)
+    for _ in range(100):
+        first, second = rng.normal(means, 1, (2, 2, 3))  # two runs, three games
+        apart += abs(metrics.aggregate_iqm(first) - metrics.aggregate_iqm(second)) > detectable_difference(first, second, 30)
+    assert apart <= 11
 
 
 def test_profiles_by_hand():
