@@ -6,21 +6,13 @@ Experimental: it has not been measured on a GPU yet. All that this package knows
 
 import warnings
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import torch as th
 from torch import nn
 
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
-
-
-class Terms(Protocol):
-    """What an objective returns."""
-
-    @property
-    def loss(self) -> th.Tensor:
-        """What is minimised, a scalar."""
 
 
 class CapturedGradients:
@@ -32,7 +24,7 @@ class CapturedGradients:
 
     The objective must not read a number back from the GPU, as a matrix exponential does.
 
-    :param objective: what is minimised, a function of samples and of a tuple of coefficients
+    :param objective: a function of samples and coefficients; what it returns has the scalar ``loss``, which is minimised
     :param policy: the networks that it evaluates
     :param parameters: what is trained; their ``grad`` must be ``None`` at each call
     """
@@ -41,7 +33,7 @@ class CapturedGradients:
 
     def __init__(
         self,
-        objective: Callable[[SequenceReplayBufferSamples, Any], Terms],
+        objective: Callable[[SequenceReplayBufferSamples, Any], Any],
         policy: EqRPolicy,
         parameters: list[nn.Parameter],
     ):
@@ -104,11 +96,7 @@ class CapturedGradients:
         return terms
 
     def _capture(self, coefs: Hashable) -> bool:
-        """
-        Record a call; nothing is computed yet.
-
-        :return: whether that worked
-        """
+        """Record a call, which computes nothing yet; whether that worked."""
         graph = th.cuda.CUDAGraph()
         try:
             # A capture that fails may leave its stream current: the outer context restores this one.

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 
+from sb3_eqr.common import validation
 from sb3_eqr.common.cuda_graph import CapturedGradients
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy, find_optimizer
@@ -25,33 +26,9 @@ from sb3_eqr.common.resets import Resets, ResetSchedule
 from sb3_eqr.common.save_util import SafeFiles, read_description
 from sb3_eqr.common.transfer import load_representation, representation
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
-from sb3_eqr.common.validation import (
-    answers_misspelt,
-    check_action_space,
-    check_finite,
-    check_losses,
-    check_names,
-    check_normalization,
-    check_number,
-    check_policy,
-    check_replay,
-    check_same_parameters,
-)
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
-# argument -> smallest and largest legal value, whether it is an integer
-RANGES: dict[str, tuple[float, float, bool]] = {
-    "prediction_depth": (0, np.inf, True),
-    "shift_pixels": (0, np.inf, True),
-    "td_coef": (0, np.inf, False),
-    "aet_coef": (0, np.inf, False),
-    "symmetry_coef": (0, np.inf, False),
-    "reward_coef": (0, np.inf, False),
-    "intensity_scale": (0, np.inf, False),
-    "tau": (0, 1, False),
-    "batch_size": (1, np.inf, True),
-}
 # Arguments of the replay buffer that are arguments of the algorithm, which moves them.
 SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
 
@@ -76,7 +53,7 @@ class EqRAlgorithm(SafeFiles):
     _create_aliases: Callable[[], None]  # of the stock algorithm: its own names of the networks
     frame_stack = 1
 
-    @answers_misspelt
+    @validation.answers_misspelt
     def __init__(
         self,
         policy: str | type[EqRPolicy],
@@ -137,20 +114,16 @@ class EqRAlgorithm(SafeFiles):
             many frames an image observation stacks (found where ``VecFrameStack`` is used)
         :param optimize_memory_usage: has no effect: memory is always saved
         :param n_steps: n of the n-step return
-        :param target_update_interval: update the target every so many environment steps, as QRDQN and DQN do;
-            ``None``: after every gradient step, as the paper asks
-        :param exploration_fraction: fraction of entire training period over which the exploration rate is reduced;
-            2,000 of 100,000 steps, after which the noisy layers explore
-        :param exploration_initial_eps: initial value of random action probability; above 1 the actions are random until the
-            line has come down to 1
+        :param target_update_interval: environment steps between two target updates, as in QRDQN; ``None``: each gradient step
+        :param exploration_fraction: fraction of training over which the exploration rate falls; then noisy layers explore
+        :param exploration_initial_eps: initial value of random action probability; above 1: random until it falls below
         :param exploration_final_eps: final value of random action probability
         :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
         :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
         :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss; 0 switches it off
         :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
         :param reward_coef: λ₁ ≥ 0, weight of the reward loss; 0 switches it off
-        :param td_coef: weight of the TD loss; 0: no Q-learning, the representation alone is trained
-            (:func:`~sb3_eqr.representation.train_representation`), and replay priorities stay as they are
+        :param td_coef: ≥ 0, weight of the TD loss; 0: no Q-learning, the representation alone is trained, priorities stay
         :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
         :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
         :param shift_pixels: random shift of images, in pixels; 0 switches it off
@@ -225,12 +198,8 @@ class EqRAlgorithm(SafeFiles):
         if _init_setup_model:
             self._setup_model()
 
-    # ------------------------------------------------------------------------------------------------------- set-up
-
     def _setup_model(self) -> None:
-        """
-        Instead of SB3's, in the same order: SB3's refuses n-step replay of dict observations and a target per gradient step.
-        """
+        """In place of SB3's, in its order: that one refuses n-step replay of dicts and a target per gradient step."""
         self._check_arguments()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -241,12 +210,11 @@ class EqRAlgorithm(SafeFiles):
         self.policy = self._make_policy()
         self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
         saved, self.policy_description = self.policy_description, self.policy.description
-        check_same_parameters(self.policy_description, saved)
+        validation.check_same_parameters(self.policy_description, saved)
         self._convert_train_freq()
         self._create_aliases()
-        self.exploration_schedule = LinearSchedule(
-            self.exploration_initial_eps, self.exploration_final_eps, self.exploration_fraction
-        )
+        epsilons = self.exploration_initial_eps, self.exploration_final_eps
+        self.exploration_schedule = LinearSchedule(*epsilons, self.exploration_fraction)
         if self.representation_frozen:
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
@@ -257,15 +225,19 @@ class EqRAlgorithm(SafeFiles):
 
     def _check_arguments(self) -> None:
         name = type(self).__name__
-        check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
-        check_normalization(self._vec_normalize_env, self.observation_space)
-        check_replay(name, self.replay_buffer_class, SequenceReplayBuffer, self.replay_buffer_kwargs, SET_BY_ALGORITHM)
-        for argument, (low, high, whole) in RANGES.items():
-            check_number(argument, getattr(self, argument), low, high, whole)
+        validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
+        validation.check_normalization(self._vec_normalize_env, self.observation_space)
+        chosen, given = self.replay_buffer_class, self.replay_buffer_kwargs
+        validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
+        for argument in ("td_coef", "aet_coef", "symmetry_coef", "reward_coef", "intensity_scale"):
+            validation.check_number(argument, getattr(self, argument), 0)
+        for argument, least in {"prediction_depth": 0, "shift_pixels": 0, "batch_size": 1}.items():
+            validation.check_number(argument, getattr(self, argument), least, whole=True)
+        validation.check_number("tau", self.tau, 0, 1)
         if self.target_update_interval is not None:
-            check_number("target_update_interval", self.target_update_interval, 1, whole=True)
+            validation.check_number("target_update_interval", self.target_update_interval, 1, whole=True)
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
-        check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
         noisy = self.policy_kwargs.get("noisy", True)
         if self.exploration_final_eps == 0 and not noisy and self.resets.interval is None:  # resets explore, too
             warnings.warn(
@@ -281,12 +253,11 @@ class EqRAlgorithm(SafeFiles):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        check_action_space(wrapped.action_space)
+        validation.check_action_space(wrapped.action_space)
         return wrapped
 
     def _make_policy(self) -> EqRPolicy:
-        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
-        assert isinstance(policy, EqRPolicy)
+        policy: Any = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         return policy.to(self.device)
 
     def _make_replay_buffer(self) -> SequenceReplayBuffer:
@@ -294,33 +265,24 @@ class EqRAlgorithm(SafeFiles):
         buffer_class = self.replay_buffer_class or default
         legal = inspect.signature(buffer_class).parameters
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in legal.values()):
-            check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
-        kwargs = {
-            "n_steps": max(self.n_steps, self._resets.schedule.initial_n_steps or 0),  # the longest that it must hold
-            "gamma": self.gamma,
-            "prediction_depth": self.depth,
-            **self.replay_buffer_kwargs,
-            "frame_stack": self.frame_stack,
-        }
-        return buffer_class(
-            self.buffer_size, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **kwargs
-        )
+            validation.check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
+        longest = max(self.n_steps, self._resets.schedule.initial_n_steps or 0)  # that it must hold
+        kwargs: dict[str, Any] = {"n_steps": longest, "gamma": self.gamma, "prediction_depth": self.depth}
+        kwargs |= {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack, "n_envs": self.n_envs}
+        return buffer_class(self.buffer_size, self.observation_space, self.action_space, self.device, **kwargs)
 
     def _find_frame_stack(self) -> int:
+        stack: Any = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
         found = 1
-        stack = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
-        if isinstance(stack, VecFrameStack) and is_image_space(self.observation_space):
+        if stack is not None and is_image_space(self.observation_space):
             # Frames lie side by side along the first axis only if channels were what was stacked.
-            channels_first = is_image_space_channels_first(stack.venv.observation_space)  # type: ignore[arg-type]
-            if stack.stacked_obs.channels_first == channels_first:
+            if stack.stacked_obs.channels_first == is_image_space_channels_first(stack.venv.observation_space):
                 found = stack.stacked_obs.n_stack
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
-    # ------------------------------------------------------------------------------------------------ environment
-
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
+        validation.check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
         return result
 
     def _store_transition(
@@ -335,10 +297,10 @@ class EqRAlgorithm(SafeFiles):
         # What VecNormalize has clipped may hide an infinity: its originals are looked at.
         normalize, step = self._vec_normalize_env, self.num_timesteps
         try:
-            check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
-            check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
+            validation.check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
+            validation.check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
             for info in infos:
-                check_finite("terminal observation", info.get("terminal_observation", 0), step)
+                validation.check_finite("terminal observation", info.get("terminal_observation", 0), step)
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         except ValueError:
             self._last_obs = None  # the environment has moved on: another call of learn must reset it
@@ -347,19 +309,15 @@ class EqRAlgorithm(SafeFiles):
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
         self._n_calls += 1
-        interval = self.target_update_interval
-        if interval is not None and self._n_calls % max(interval // self.n_envs, 1) == 0:
+        if self.target_update_interval and self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
             self.policy.update_target(self.tau)
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last round may end beyond the total. A schedule that is a line, such as RL Zoo's, would give a learning rate
-        # below 0 there, which is gradient ascent.
+        # The last round may end beyond the total, where a linear schedule gives a learning rate below 0: gradient ascent.
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
-
-    # --------------------------------------------------------------------------------------------------- training
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -386,8 +344,7 @@ class EqRAlgorithm(SafeFiles):
             else:
                 terms = self.objective(samples, coefs)
                 terms.loss.backward()
-            max_norm = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-            grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
+            grad_norm = nn.utils.clip_grad_norm_(self._trained, th.inf if self.max_grad_norm is None else self.max_grad_norm)
             optimizer.step()
             self._n_updates += 1
             policy.target_is_copy = False
@@ -452,18 +409,12 @@ class EqRAlgorithm(SafeFiles):
         self._log_last_round()
         super().dump_logs()
 
-    # --------------------------------------------------------------------------------------------------- parameters
-
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """
-        As SB3's ``set_parameters``, with the same parameters.
-
-        :raises ValueError: for a file with parameters for another group or another return distribution
-        """
+        """As SB3's ``set_parameters``; a file with parameters for another group or return distribution raises ValueError."""
         if not isinstance(load_path_or_dict, dict):
-            check_same_parameters(self.policy_description, read_description(load_path_or_dict))
+            validation.check_same_parameters(self.policy_description, read_description(load_path_or_dict))
         self._monitor.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
         for parameter, state in self.policy.optimizer.state.items():
@@ -475,12 +426,10 @@ class EqRAlgorithm(SafeFiles):
         self: SelfEqRAlgorithm, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False
     ) -> SelfEqRAlgorithm:
         """
-        Start from the representation of another run: encoder, κ, ρ and b are taken from its file, the Q head and the reward
-        predictor stay this agent's own. The tasks must have the same observations and actions (paper, §4).
+        Start from encoder, κ, ρ and b of another run, for the same observations and actions (paper, §4).
 
-        :param path: what ``save`` of either agent wrote, or of :func:`~sb3_eqr.representation.train_representation`
+        :param path: what ``save`` of either agent wrote
         :param freeze: whether they stay as they are from now on; ``aet_coef=0, symmetry_coef=0`` then saves their time
-        :return: this agent
         :raises ValueError: if it does not fit: another group, trunk or number of actions; nothing is changed then
         """
         if freeze and self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):

@@ -115,12 +115,8 @@ class LatentModel(nn.Module):
 
     def rollout(self, state: th.Tensor, one_hot: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """
-        x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1} (Eq. 10), held where the episode has ended.
-
-        :param state: x₀, (B, D)
-        :param one_hot: actions, (B, M, A)
-        :param mask: (B, M)
-        :return: x̂_1 ... x̂_M, (B, M, D)
+        x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1} (Eq. 10), held where the episode has ended: from x₀, (B, D), one-hot actions,
+        (B, M, A), and the mask, (B, M), to x̂_1 ... x̂_M, (B, M, D).
         """
         states = []
         goes_on = (mask > 0)[:, :, None]  # (B, M, 1)
@@ -130,35 +126,20 @@ class LatentModel(nn.Module):
         return th.stack(states, dim=1)
 
     def action_element(self, state: th.Tensor, one_hot: th.Tensor) -> th.Tensor:
-        """
-        κ(x, a), or κ(a).
-
-        :param state: (B, D)
-        :param one_hot: (B, A)
-        :return: K group elements, (B, K, *element_shape)
-        """
+        """κ(x, a), or κ(a): a state, (B, D), and one-hot actions, (B, A), to K group elements, (B, K, *element_shape)."""
         inputs = th.cat([state, one_hot], dim=1) if self.state_dependent_actions else one_hot
         return self.element(self.transition(inputs))
 
     def act(self, elements: th.Tensor, state: th.Tensor) -> th.Tensor:
-        """
-        :param elements: (B, K, *element_shape)
-        :param state: (B, D)
-        :return: elements · state, (B, D)
-        """
+        """Elements · state: (B, K, *element_shape) and (B, D) to (B, D)."""
         return self.group.compose(elements, self.blocks(state)).flatten(1)
 
     def _symmetry_loss(
         self, state: th.Tensor, predicted: th.Tensor, one_hot: th.Tensor, target_state: th.Tensor, target: "LatentModel"
     ) -> th.Tensor:
         """
-        Eq. 19: τ_g moves the predicted next state; ρ(τ_g) κ̄ moves the partner's state; both should arrive together.
-
-        :param state: x₀, (B, D)
-        :param predicted: x̂₁, (B, D)
-        :param one_hot: a_t, (B, A)
-        :param target_state: x̄₀, (B, D)
-        :return: (B,)
+        Eq. 19: τ_g moves the predicted next state x̂₁; ρ(τ_g) κ̄ moves the partner's state; both should arrive together. From
+        x₀, x̂₁ and x̄₀, (B, D) each, and one-hot a_t, (B, A), to (B,).
         """
         partner = target_state[th.randint(len(state), (len(state),), device=state.device)]  # x̄_j of Algorithm 1
         with th.no_grad():  # τ_g carries no gradient, as in the authors' code
@@ -171,17 +152,11 @@ class LatentModel(nn.Module):
         return normalized_distance(self.projection(moved_prediction), target.projection(moved_partner))
 
     def blocks(self, state: th.Tensor) -> th.Tensor:
-        """
-        :param state: (B, D)
-        :return: (B, K, *element_shape)
-        """
-        return state.unflatten(1, (self.n_blocks, *self.group.element_shape))  # (B, K, *element_shape)
+        """The blocks of a flat state: (B, D) to (B, K, *element_shape)."""
+        return state.unflatten(1, (self.n_blocks, *self.group.element_shape))
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        """
-        :param params: (B, K * num_params)
-        :return: (B, K, *element_shape)
-        """
+        """Group elements from their parameters: (B, K * num_params) to (B, K, *element_shape)."""
         return self.group.element(params.unflatten(1, (self.n_blocks, self.group.num_params)))
 
 

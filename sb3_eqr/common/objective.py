@@ -35,9 +35,7 @@ class LossTerms(NamedTuple):
     q_values: th.Tensor | None = None  # (B,), no gradient: Q(s_t, a_t)
 
     def metrics(self) -> dict[str, th.Tensor]:
-        """
-        :return: what is logged, scalars without gradient
-        """
+        """What is logged: scalars without gradient."""
         terms = zip(self._fields[:4], self[:4], strict=True)
         with th.no_grad():
             found = {f"{name}_loss": term.mean() for name, term in terms if term is not None}
@@ -63,10 +61,7 @@ class Objective:
         self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: LossCoefs) -> LossTerms:
-        """
-        :param samples: B windows; without a rollout (M = 0) there are no auxiliary losses
-        :param coefs: the weights of the terms, at least one of them above 0
-        """
+        """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
         state = self.policy.online.encode(observations)  # x₀, (B, D): TD and auxiliary losses meet here and nowhere else
         td = priorities = q_values = None
@@ -78,12 +73,7 @@ class Objective:
         return LossTerms(td, *latent, loss, priorities, q_values)
 
     def _td_terms(self, samples: SequenceReplayBufferSamples, state: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """
-        Distributional Q-learning on the n-step transition.
-
-        :param state: x₀, (B, D)
-        :return: TD loss, new priorities and Q(s_t, a_t), (B,) each, the latter two without gradient
-        """
+        """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
         online, target = self.policy.online, self.policy.target
         with th.no_grad():
             next_observations = self.augment(samples.next_observations)
@@ -102,12 +92,7 @@ class Objective:
     def _latent_losses(
         self, samples: SequenceReplayBufferSamples, state: th.Tensor, observations: PyTorchObs, coefs: LossCoefs
     ) -> LatentLosses:
-        """
-        The auxiliary losses along the rollout.
-
-        :param state: x₀, (B, D)
-        :param observations: s_t, augmented: the target copy sees the same draw
-        """
+        """The auxiliary losses along the rollout; the target copy sees s_t in the same augmentation."""
         policy = self.policy
         if samples.mask is None:
             return LatentLosses(None, None, None)
@@ -129,9 +114,7 @@ class Objective:
         )
 
     def _encode_rollout(self, network: EqRNetwork, samples: SequenceReplayBufferSamples) -> th.Tensor:
-        """
-        :return: (B, M, D)
-        """
+        """x̄₁ ... x̄_M, (B, M, D)."""
         assert samples.mask is not None and samples.rollout_observations is not None
         observations: Any = samples.rollout_observations
         is_dict = isinstance(observations, dict)
@@ -141,22 +124,14 @@ class Objective:
 
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    :param outputs: of a head, (B, N, A)
-    :param actions: (B, 1), int64
-    :return: the outputs for these actions, (B, N)
-    """
+    """Outputs of a head, (B, N, A), for actions, (B, 1): (B, N)."""
     return outputs.gather(dim=2, index=actions[..., None].expand(-1, outputs.shape[1], 1)).squeeze(dim=2)
 
 
 class Augmentation:
     """
-    What the networks see in an update: images shifted, then their intensity, then SB3's ``preprocess_obs``.
-
-    :param observation_space: any that SB3 supports; of a dict, the parts that are images are augmented
-    :param normalize_images: whether images are bytes, which SB3 divides by 255; else they are floats already
-    :param shift_pixels: ≥ 0, 0 switches the shift off
-    :param intensity_scale: ≥ 0, 0 switches the intensity off
+    What the networks see in an update: images (of a dict, its images) are shifted, then their intensity is scaled, then SB3's
+    ``preprocess_obs``. ``normalize_images``: whether images are bytes, which SB3 divides by 255; else they are floats already.
     """
 
     def __init__(self, observation_space: spaces.Space, normalize_images: bool, shift_pixels: int, intensity_scale: float):
@@ -168,10 +143,7 @@ class Augmentation:
         self.intensity_scale = intensity_scale
 
     def __call__(self, observations: PyTorchObs) -> PyTorchObs:
-        """
-        :param observations: (B, *obs_shape), images (B, C, H, W), or a dict of these
-        :return: floats, what a features extractor takes
-        """
+        """Observations, (B, *obs_shape) or a dict of these, to what a features extractor takes: floats."""
         if isinstance(observations, dict):
             return {key: self._part(key, obs) for key, obs in observations.items()}
         return self._part("", observations)
@@ -191,11 +163,8 @@ _PIECE = 2 << 20  # numbers in the observations of one pass on a CPU: 8 MiB as f
 
 def in_pieces(observations: dict[str, th.Tensor]) -> list[dict[str, th.Tensor]]:
     """
-    What a pass without gradient takes at a time: on a CPU as much as its caches hold, in blocks of memory that the C library
-    keeps, whatever M; elsewhere everything.
-
-    :param observations: (N, ...) each
-    :return: the same, in order, cut along the first axis
+    Observations, (N, ...) each, cut along the first axis into what a pass without gradient takes at a time: on a CPU as much
+    as its caches hold, in blocks of memory that the C library keeps, whatever M; elsewhere everything.
     """
     tensors = list(observations.values())
     if tensors[0].device.type != "cpu":

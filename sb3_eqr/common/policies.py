@@ -11,13 +11,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
 from sb3_eqr.common.networks.group_encoder import DEFAULT_GROUP, GroupFeaturesExtractor
-from sb3_eqr.common.networks.layers import NoisyLinear, Whitening
+from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.networks.trunks import ConvTrunk, ImageExtractor, find_trunk
 from sb3_eqr.common.type_aliases import PyTorchObs
@@ -48,9 +47,8 @@ class EqRPolicy(BasePolicy):
     :param features_extractor_class: the trunk; the group encoder is put behind it. Its class or its name: "nature" (the
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``). ``None``: SB3's
         ``FlattenExtractor`` (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
-    :param features_extractor_kwargs: its keyword arguments. "nature" takes ``layers`` (filters, kernel size and stride of each
-        convolution), "impala" takes ``width_scale`` (multiplies its channels; BBF has 4), both take ``rescale`` (latents of
-        each sample scaled to [0, 1], as in SPR and BBF)
+    :param features_extractor_kwargs: its keyword arguments: those of
+        :class:`~sb3_eqr.common.networks.trunks.ConvExtractor` for "nature", of ``ImpalaExtractor`` beside it for "impala"
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate. The agent's constructor adds ``eps=1.5e-4``
@@ -82,6 +80,7 @@ class EqRPolicy(BasePolicy):
     default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     action_space: spaces.Discrete
     net_arch: list[int]
+    activation_fn: type[nn.Module]
     latent_model: LatentModel
     latent_model_target: LatentModel
     own_projection: nn.Linear | None
@@ -188,18 +187,13 @@ class EqRPolicy(BasePolicy):
         )
 
     def _make_network(self, network_class: type[Network], n_atoms: int, **kwargs: Any) -> Network:
-        network_args: dict[str, Any] = {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "net_arch": self.net_arch,
-            "activation_fn": self.activation_fn,
-            "normalize_images": self.normalize_images,
-            "n_atoms": n_atoms,
-            "dueling": self.dueling,
-            "sigma_init": self.sigma_init if self.noisy else None,
-        }
-        network_args = self._update_features_extractor(network_args, features_extractor=None)
-        return network_class(**network_args, **kwargs).to(self.device)
+        encoder, n_actions = self.make_features_extractor(), int(self.action_space.n)
+        sigma_init = self.sigma_init if self.noisy else None
+        head = DistributionalHead(
+            encoder.features_dim, n_actions, n_atoms, self.net_arch, self.activation_fn, self.dueling, sigma_init
+        )
+        network = network_class(self.observation_space, self.action_space, encoder, head, self.normalize_images, **kwargs)
+        return network.to(self.device)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # type: ignore[misc]
@@ -208,14 +202,9 @@ class EqRPolicy(BasePolicy):
             group, n_blocks = encoder.group, encoder.n_blocks
         else:
             group, n_blocks = NoGroup(encoder.features_dim), 1
+        losses = self.reward_loss, self.aet_loss
         self.latent_model = LatentModel(
-            group,
-            n_blocks,
-            int(self.action_space.n),
-            self.latent_hidden_dim,
-            self.reward_loss,
-            self.aet_loss,
-            self.state_dependent_actions,
+            group, n_blocks, int(self.action_space.n), self.latent_hidden_dim, *losses, self.state_dependent_actions
         ).to(self.device)
         self.latent_model_target = _frozen_copy(self.latent_model)
         parameters = list(self.latent_model.parameters())
@@ -236,9 +225,7 @@ class EqRPolicy(BasePolicy):
 
     @property
     def description(self) -> dict[str, str]:
-        """
-        :return: what the shapes of parameters do not say, by name, in words that stand in a model's file
-        """
+        """What the shapes of parameters do not say, by name, in words that are saved in a model's file."""
         encoder = self.online.features_extractor
         return {"group": encoder.description if isinstance(encoder, GroupFeaturesExtractor) else "no group"}
 
@@ -256,17 +243,13 @@ class EqRPolicy(BasePolicy):
         return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)
 
     def check_losses(self, aet: bool, symmetry: bool) -> None:
-        """
-        :param aet: whether the AET loss is asked for
-        :param symmetry: whether the GET loss is asked for
-        :raises ValueError: if this policy cannot serve one of them
-        """
+        """Raise ValueError if this policy cannot serve the AET or the GET (``symmetry``) loss that is asked for."""
         if symmetry and not self.latent_model.group.has_inverse:
             raise ValueError(
                 f"symmetry_coef: the GET loss needs a group with inverses, found group={self.group!r}. "
                 "Pass symmetry_coef=0 or another group."
             )
-        if aet and self.projection == "head" and not self.online.net_arch:
+        if aet and self.projection == "head" and not self.net_arch:
             raise ValueError(
                 "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
                 'Pass policy_kwargs={"net_arch": [256]} or {"projection": "own"}, or aet_coef=0.'
@@ -288,11 +271,7 @@ class EqRPolicy(BasePolicy):
         return network.head.project if self.projection == "head" else nn.Identity()
 
     def update_target(self, tau: float) -> None:
-        """
-        Move the one target copy: encoder, Q head, κ, b.
-
-        :param tau: in [0, 1]; 1 copies
-        """
+        """Move the one target copy (encoder, Q head, κ, b) by ``tau`` in [0, 1]; 1 copies."""
         online, target, online_statistics, target_statistics = self._target_tensors
         self.target_is_copy = tau == 1
         with th.no_grad():
@@ -335,7 +314,8 @@ class EqRPolicy(BasePolicy):
         """Parameters of the online parts, of their target copies, running statistics of both."""
         parts = list(zip(*self._target_pairs(), strict=True))
         parameters = [[p for module in side for p in module.parameters()] for side in parts]
-        statistics = [[t for module in side for t in get_parameters_by_name(module, ["running_"])] for side in parts]
+        # The buffers themselves: tensors of a state dict would share their memory until the policy is pickled.
+        statistics = [[b for module in side for n, b in module.named_buffers() if "running_" in n] for side in parts]
         return (*parameters, *statistics)
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> "EqRPolicy":
@@ -352,11 +332,7 @@ class EqRPolicy(BasePolicy):
         return [(online, target) for online, target in pairs if online is not None and target is not None]
 
     def set_training_mode(self, mode: bool) -> None:
-        """
-        Put everything that is trained into train or eval mode; the target copy stays in eval mode.
-
-        :param mode: True for training
-        """
+        """Put everything that is trained into train or eval mode; the target copy stays in eval mode."""
         if mode == self.training:
             return  # SB3 asks at every step of an environment, and going through all modules takes a while
         super().set_training_mode(mode)
@@ -365,11 +341,7 @@ class EqRPolicy(BasePolicy):
             module.eval()
 
     def freeze(self, modules: list[nn.Module]) -> None:
-        """
-        Leave modules as they are from now on, parameters and batch statistics; those of an earlier call are let go.
-
-        :param modules: parts of this policy
-        """
+        """Leave parts of this policy as they are from now on, parameters and batch statistics; earlier ones are released."""
         for module in self._frozen:
             module.requires_grad_(True).train(self.training)
         for module in modules:
@@ -381,10 +353,7 @@ class EqRPolicy(BasePolicy):
 
 
 def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
-    """
-    :param optimizer: a class, or its name in ``torch.optim``
-    :raises ValueError: for an unknown name
-    """
+    """A class, or by its name in ``torch.optim``; raises ValueError for an unknown name."""
     if not isinstance(optimizer, str):
         return optimizer
     found = getattr(th.optim, optimizer, None)
@@ -398,10 +367,8 @@ def _decay_matrices_only(policy: EqRPolicy) -> None:
     noise = {id(module.weight_sigma) for module in policy.modules() if isinstance(module, NoisyLinear)}
     for group in list(policy.optimizer.param_groups):
         if group.get("weight_decay"):
-            spared = [parameter for parameter in group["params"] if parameter.ndim < 2 or id(parameter) in noise]
-            group["params"] = [
-                parameter for parameter in group["params"] if parameter.ndim >= 2 and id(parameter) not in noise
-            ]
+            spared = [p for p in group["params"] if p.ndim < 2 or id(p) in noise]
+            group["params"] = [p for p in group["params"] if p.ndim >= 2 and id(p) not in noise]
             policy.optimizer.add_param_group({**group, "params": spared, "weight_decay": 0.0})
 
 

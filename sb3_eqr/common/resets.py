@@ -57,45 +57,29 @@ class ResetSchedule:
 
 
 class Resets:
-    """
-    The resets of one agent so far.
-
-    :param schedule: when the next one is due
-    """
+    """The resets of one agent so far, and what follows from them and the schedule."""
 
     def __init__(self, schedule: ResetSchedule):
         self.schedule = schedule
         self.done: list[int] = []  # the number of updates before each
 
     def updates_since(self, n_updates: int) -> int:
-        """
-        :param n_updates: done so far
-        :return: those since the last reset, or since the start
-        """
+        """Of so many updates, those since the last reset, or since the start."""
         return n_updates - (self.done[-1] if self.done else 0)
 
     def is_due(self, n_updates: int, progress_remaining: float) -> bool:
-        """
-        :param n_updates: done so far
-        :param progress_remaining: from 1 (start of training) to 0
-        """
+        """After so many updates, with so much of training remaining, from 1 to 0."""
         interval, over = self.schedule.interval, 1.0 - progress_remaining >= self.schedule.end
         return interval is not None and self.updates_since(n_updates) >= interval and not over
 
     def roll_back(self, n_updates: int) -> None:
-        """
-        :param n_updates: of the model that was put back; resets that came later are forgotten
-        """
+        """Forget the resets that came after so many updates."""
         self.done = [reset for reset in self.done if reset < n_updates]
 
     def annealed(self, n_updates: int, n_steps: int, gamma: float) -> tuple[int, float]:
         """
-        Geometric: n passes 5 half-way from 10 to 3, and the horizon 1 / (1 - γ) grows by the same factor in the same time.
-
-        :param n_updates: done so far
-        :param n_steps: n at the end of annealing
-        :param gamma: γ at the end of annealing
-        :return: n and γ now
+        n and γ after so many updates, ``n_steps`` and ``gamma`` at the end of annealing. Geometric: n passes 5 half-way from
+        10 to 3, and the horizon 1 / (1 - γ) grows by the same factor in the same time.
         """
         first_n, first_gamma = self.schedule.initial_n_steps, self.schedule.initial_gamma
         progress = min(self.updates_since(n_updates) / self.schedule.annealing_steps, 1.0)

@@ -59,10 +59,8 @@ def is_whole_model(path: pathlib.Path) -> bool:
 
 def read_description(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, str]:
     """
-    What the parameters in a model's file are of, which their shapes do not say. Nothing in the file is executed for it.
-
-    :param path: of a file, its ending may be left out, or a file-like, which is left where it was
-    :return: ``EqRPolicy.description`` of the model that was saved; empty for a file of another algorithm
+    ``EqRPolicy.description`` of the model in a file (or file-like, which is left where it was); empty for one of another
+    algorithm. Nothing in the file is executed for it.
     """
     place = path if isinstance(path, (str, pathlib.Path)) else path.tell()
     found = find_file(path) if isinstance(path, (str, pathlib.Path)) else path
@@ -76,17 +74,12 @@ def read_description(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, 
 
 
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
-    """
-    :param path: of a model's file, its ending may be left out
-    """
+    """A model's file by its path, whose ending may be left out."""
     return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
-    """
-    :param action_space: SB3 draws random actions from its generator
-    :return: the state of all generators that training draws from
-    """
+    """The state of all generators that training draws from; SB3 draws random actions from that of the action space."""
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(),
@@ -97,10 +90,7 @@ def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
 
 
 def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
-    """
-    :param state: from :func:`get_rng_state`
-    :param action_space: whose generator to set
-    """
+    """The way back to a state of :func:`get_rng_state`."""
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
@@ -118,13 +108,7 @@ class SafeFiles(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """
-        As SB3's ``save``, with the state of the random generators, and never by half: the file is written beside and renamed.
-
-        :param path: path to the file, or a file-like
-        :param exclude: names of attributes to leave out beside the default ones
-        :param include: names of attributes to save although they are left out by default
-        """
+        """As SB3's ``save``, with the state of the random generators; the file is written beside and renamed."""
         self._before_saving()
         self.rng_state = get_rng_state(self.action_space)
         if not isinstance(path, (str, pathlib.Path)):
@@ -148,12 +132,11 @@ class SafeFiles(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> SelfSafeFiles:
         """
-        As SB3's ``load``, with the same parameters. Where the model has a seed (and no other is given here), the random
-        generators are put back to where they were at saving: a run that was saved after ``learn``, or between two
-        rollouts, goes on as if it had not stopped (pass ``force_reset=False`` and an environment in the same state).
-        SB3's CheckpointCallback saves in the middle of a step: its files go on from a fresh episode.
+        As SB3's ``load``, with the same parameters. If the model has a seed (and no other is given here), the random
+        generators are restored: a run that was saved after ``learn``, or between two rollouts, is resumed exactly (pass
+        ``force_reset=False`` and an environment in the same state). SB3's CheckpointCallback saves in the middle of a step.
 
-        :raises ValueError: if the file is cut off, or was saved by another class
+        :raises ValueError: if the file is truncated, or was saved by another class
         """
         if isinstance(path, (str, pathlib.Path)):
             found = find_file(path)
@@ -169,11 +152,7 @@ class SafeFiles(OffPolicyAlgorithm):
         return model
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """
-        As SB3's, but never by half: the file is written beside and renamed.
-
-        :param path: path to the file, or a file-like
-        """
+        """As SB3's ``save_replay_buffer``; the file is written beside and renamed."""
         if not isinstance(path, (str, pathlib.Path)):
             super().save_replay_buffer(path)
             return
@@ -182,11 +161,9 @@ class SafeFiles(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        As SB3's.
+        As SB3's ``load_replay_buffer``; ``truncate_last_traj`` has no effect here.
 
-        :param path: path to the file, or a file-like
-        :param truncate_last_traj: has no effect here
-        :raises ValueError: if the file is cut off, or holds a buffer of another kind, or for other spaces or environments;
+        :raises ValueError: if the file is truncated, or holds a buffer of another kind, or for other spaces or environments;
             the model then keeps the buffer it had
         """
         before = self.replay_buffer

@@ -50,16 +50,12 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
 
 
 def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
-    """
-    :return: the encoder and the parts of the latent model that do not depend on rewards
-    """
+    """The encoder and the parts of the latent model that do not depend on rewards, by name."""
     return {ENCODER: policy.online.features_extractor} | {name: getattr(policy.latent_model, name) for name in LATENT_PARTS}
 
 
 def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device) -> dict[str, dict[str, th.Tensor]]:
-    """
-    :return: the parameters of each part of the representation in a file
-    """
+    """The parameters of each part of the representation in a file."""
     if isinstance(path, (str, pathlib.Path)):
         found_file = find_file(path)
         if found_file is not None and not is_whole_model(found_file):

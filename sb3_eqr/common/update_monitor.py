@@ -9,12 +9,7 @@ from torch import nn
 
 
 class BadUpdateError(FloatingPointError):
-    """
-    An update whose metrics are not finite. Model and optimiser have been put back.
-
-    :param message: what was found
-    :param n_updates: the number of updates that the model is left with
-    """
+    """An update whose metrics are not finite. Model and optimiser have been put back to after ``n_updates`` updates."""
 
     def __init__(self, message: str, n_updates: int):
         super().__init__(message)
@@ -60,11 +55,7 @@ class UpdateMonitor:
         self._last = self._sound = None
 
     def start_round(self, n_updates: int) -> None:
-        """
-        Remember model and optimiser as they are now, if the last backup is old enough.
-
-        :param n_updates: updates done so far
-        """
+        """After so many updates, remember model and optimiser as they are, if the last backup is old enough."""
         self._round_start = n_updates
         if self._last is not None and n_updates < self._last.n_updates + self.INTERVAL:
             return
@@ -74,9 +65,7 @@ class UpdateMonitor:
         self._last = Backup(n_updates, deepcopy(self._model.state_dict()), deepcopy(self._optimizer.state_dict()))
 
     def add(self, metrics: dict[str, th.Tensor]) -> None:
-        """
-        :param metrics: of one update, scalars; the names are the same for all updates of a round
-        """
+        """Note the metrics of one update, scalars by name; the names are the same for all updates of a round."""
         self._has_updates = True
         self._names = list(metrics)
         self._pending.append(th.stack(list(metrics.values())))

@@ -31,12 +31,7 @@ def check_number(name: str, value: Any, low: float, high: float = np.inf, whole:
 
 
 def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
-    """
-    :param what: the name of the values, for the message
-    :param values: from the environment; integers are always finite
-    :param step: number of environment steps so far, for the message
-    :raises ValueError: if one is NaN or infinite
-    """
+    """Refuse values (``what`` they are) of the environment, after so many steps, of which one is NaN or infinite."""
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         array = np.asarray(array)
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
@@ -48,17 +43,13 @@ def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, s
 
 
 def check_names(owner: str, given: Iterable[str], legal: Iterable[str]) -> None:
-    """
-    :param owner: whose arguments these are
-    :param given: names of arguments
-    :param legal: the ones that there are
-    :raises TypeError: for another name; the message has the nearest legal one, or all of them
-    """
+    """Refuse an argument of ``owner`` that is not legal, with the nearest one that is, or all of them (TypeError)."""
     legal = list(legal)
     for name in given:
         if name not in legal:
             near = get_close_matches(name, legal, n=1)
-            advice = f"Did you mean {near[0]!r}?" if near else f"It takes {', '.join(legal)}."
+            public = [one for one in legal if not one.startswith("_")]
+            advice = f"Did you mean {near[0]!r}?" if near else f"It takes {', '.join(public)}."
             raise TypeError(f"{owner} got an unexpected argument {name!r}. {advice}")
 
 
@@ -78,9 +69,7 @@ def answers_misspelt(init: Callable[P, None]) -> Callable[P, None]:
 
 
 def check_action_space(action_space: spaces.Space) -> None:
-    """
-    :raises AssertionError: (SB3's type for this) if actions are not Discrete, counted from 0
-    """
+    """Refuse actions that are not Discrete and counted from 0, with SB3's type of error for it."""
     if not isinstance(action_space, spaces.Discrete):
         raise AssertionError(
             f"The algorithm only supports {spaces.Discrete} as action space, because the Q head has one output per "
@@ -95,12 +84,7 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 
 def check_policy(owner: str, policy: Any, aliases: dict[str, type], observation_space: spaces.Space) -> None:
-    """
-    :param owner: name of the algorithm
-    :param policy: the class that was given
-    :param aliases: the algorithm's own policies by name
-    :raises ValueError: if it is not one of this algorithm, or does not fit the observations
-    """
+    """Refuse a policy class that is not derived from those of the algorithm, or that does not fit the observations."""
     base = aliases["MlpPolicy"]
     if not (isinstance(policy, type) and issubclass(policy, base)):
         raise ValueError(
@@ -115,11 +99,7 @@ def check_policy(owner: str, policy: Any, aliases: dict[str, type], observation_
 
 
 def check_normalization(normalize: VecNormalize | None, observation_space: spaces.Space) -> None:
-    """
-    :param normalize: the wrapper, if there is one
-    :param observation_space: of the outermost wrapper
-    :raises ValueError: if a wrapper around it changes observations: their originals could not be stored
-    """
+    """Refuse a wrapper around VecNormalize that changes observations: their originals could not be stored."""
     if normalize is not None and normalize.observation_space != observation_space:
         raise ValueError(
             f"VecNormalize: expected it outside every wrapper that changes observations, so that it can hand out their "
@@ -129,14 +109,7 @@ def check_normalization(normalize: VecNormalize | None, observation_space: space
 
 
 def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], set_by_owner: Iterable[str]) -> None:
-    """
-    :param owner: name of the algorithm
-    :param chosen: ``replay_buffer_class`` as it was given, or ``None``
-    :param base: the class that it must be derived from
-    :param kwargs: ``replay_buffer_kwargs`` as they were given
-    :param set_by_owner: arguments of the buffer that are arguments of the algorithm
-    :raises ValueError: for another class, or for an argument that belongs to the algorithm
-    """
+    """Refuse a ``replay_buffer_class`` not derived from ``base``, and ``replay_buffer_kwargs`` that the algorithm sets."""
     if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, base)):
         raise ValueError(
             f"replay_buffer_class: expected {base.__name__} or a class derived from it, found {chosen}. "
@@ -151,14 +124,7 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
 
 
 def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, initial_gamma: float | None) -> None:
-    """
-    :param td_coef: weight of the TD loss
-    :param depth: M as it is used, 0 where no auxiliary loss is on
-    :param batch_size: B
-    :param gamma: γ at the end of annealing
-    :param initial_gamma: γ at its start, or ``None``
-    :raises ValueError: if nothing is minimised, or if these do not fit together
-    """
+    """Refuse an objective without a loss, a batch that batch norm cannot take, and γ = 1 where γ is annealed."""
     if td_coef == 0 and depth == 0:
         raise ValueError(
             "td_coef: expected a weight above 0 where no auxiliary loss is on, found 0. "
@@ -177,13 +143,7 @@ def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, init
 
 
 def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> None:
-    """
-    Shapes do not tell whose parameters these are: SE(2) with 4 blocks and T(2) with 18 have equal ones.
-
-    :param expected: ``EqRPolicy.description`` of the model
-    :param found: that of the parameters
-    :raises ValueError: if they differ
-    """
+    """Refuse parameters of another ``EqRPolicy.description``: SE(2) with 4 blocks and T(2) with 18 have equal shapes."""
     for name in expected:
         if found.get(name, expected[name]) != expected[name]:
             raise ValueError(

@@ -29,7 +29,7 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
     @property
     def n_quantiles(self) -> int:  # type: ignore[override]
         """As in ``sb3_contrib``'s network."""
-        return self.n_atoms
+        return self.head.n_atoms
 
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         return outputs.mean(dim=1)

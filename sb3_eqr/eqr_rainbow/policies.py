@@ -31,7 +31,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         super().__init__(*args, **kwargs)
         self.v_min = v_min
         self.v_max = v_max
-        self.register_buffer("support", th.linspace(v_min, v_max, self.n_atoms), persistent=False)
+        self.register_buffer("support", th.linspace(v_min, v_max, self.head.n_atoms), persistent=False)
 
     def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
         """

@@ -59,9 +59,9 @@ def assert_same_networks(ours, theirs):
 def test_with_every_switch_off_it_is_qrdqn(n_envs, n_steps, max_grad_norm, tau):
     extra = {"n_steps": n_steps, "max_grad_norm": max_grad_norm, "tau": tau}
     env = [make_vec_env(ChainEnv, n_envs) for _ in range(2)]
-    theirs = QRDQN("MlpPolicy", env[0], policy_kwargs=dict(NETWORK), **{**SHARED, **extra}).learn(700)
+    theirs = QRDQN("MlpPolicy", env[0], policy_kwargs=dict(NETWORK), **{**SHARED, **extra}).learn(300)
     off = {"group": None, "features_extractor_class": FlattenExtractor, "dueling": False, "noisy": False}
-    ours = EqRQRDQN("MlpPolicy", env[1], policy_kwargs={**NETWORK, **off}, **{**SHARED, **OFF, **extra}).learn(700)
+    ours = EqRQRDQN("MlpPolicy", env[1], policy_kwargs={**NETWORK, **off}, **{**SHARED, **OFF, **extra}).learn(300)
     assert_same_networks(ours, theirs)
 
 
@@ -79,9 +79,9 @@ def test_the_group_encoder_is_a_plain_features_extractor():
     """The same encoder in stock QRDQN and in ours."""
     encoder = {"group": "SE(2)", "n_blocks": 3}
     theirs_kwargs = {**NETWORK, "features_extractor_class": GroupFeaturesExtractor, "features_extractor_kwargs": encoder}
-    theirs = QRDQN("MlpPolicy", ChainEnv(), policy_kwargs=theirs_kwargs, **SHARED).learn(400)
+    theirs = QRDQN("MlpPolicy", ChainEnv(), policy_kwargs=theirs_kwargs, **SHARED).learn(200)
     ours_kwargs = {**NETWORK, **encoder, "dueling": False, "noisy": False}
-    ours = EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs=ours_kwargs, **SHARED, **OFF).learn(400)
+    ours = EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs=ours_kwargs, **SHARED, **OFF).learn(200)
     assert_same_networks(ours, theirs)
 
 
@@ -89,8 +89,8 @@ def test_the_group_encoder_is_a_plain_features_extractor():
 def test_each_switch_does_something(switched_off):
     """The relation above says nothing if the switches are not wired."""
     settings = {**SHARED, "n_steps": 3, "prediction_depth": 2, "target_update_interval": None}
-    full = EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(150)
-    less = EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, switched_off: 0}).learn(150)
+    full = EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(70)
+    less = EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, switched_off: 0}).learn(70)
     assert any(not th.equal(a, b) for a, b in zip(full.quantile_net.parameters(), less.quantile_net.parameters(), strict=True))
 
 
@@ -101,7 +101,7 @@ def same_state(a, b):
 
 def test_same_seed_twice_other_seed_once():
     settings = {**SHARED, "n_steps": 3, "target_update_interval": None}
-    a, b, c = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, "seed": s}).learn(200) for s in (1, 1, 2))
+    a, b, c = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, "seed": s}).learn(80) for s in (1, 1, 2))
     assert same_state(a, b)
     assert not same_state(a, c)
 
@@ -114,6 +114,6 @@ def test_sharing_the_target_pass_changes_no_number(monkeypatch):
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
         assert model.policy.target_encodes_as_online
         monkeypatch.setattr(EqRPolicy, "target_encodes_as_online", shortcut)
-        models.append(model.learn(150))
+        models.append(model.learn(70))
         monkeypatch.undo()
     assert same_state(*models)

@@ -211,8 +211,8 @@ def test_beta_may_fall(make):
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
 def test_a_reset_to_the_last_bit(make, alpha, projection):
     network = {"projection": projection}
-    model = make(ChainEnv(), resets={"interval": 60, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(70)
-    assert model._n_updates == 60 and model._resets.done == []  # the next update comes after a reset
+    model = make(ChainEnv(), resets={"interval": 20, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(50)
+    assert model._n_updates == 20 and model._resets.done == []  # the next update comes after a reset
     old = {name: p.clone() for name, p in model.policy.state_dict().items()}
     state = th.get_rng_state()
     fresh = make(ChainEnv(), policy_kwargs=network)  # takes its seed: put the generator where the reset will find it
@@ -242,18 +242,18 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
         for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
             assert th.equal(a, b)
     before = {name: p.clone() for name, p in new.items()}
-    model.learn(60, reset_num_timesteps=False)  # and training goes on
+    model.learn(8, reset_num_timesteps=False)  # and training goes on
     still = [n for n, p in model.policy.named_parameters() if p.requires_grad and th.equal(before[n], p)]
     assert still == [] and all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
 def test_when_resets_happen(make):
-    model = make(ChainEnv(), resets={"interval": 30, "end": 0.7}).learn(140)  # 200 updates in steps 41 to 140
-    assert model._n_updates == 200
-    assert model._resets.done == [30, 60, 90]  # 70 % of 140 steps are over after 116 updates
-    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)._resets.done == [7, 14, 21, 28, 35]  # within rounds
-    assert make(ChainEnv()).learn(60)._resets.done == []
-    assert make(ChainEnv(), resets={"interval": 30, "end": 0.0}).learn(100)._resets.done == []
+    model = make(ChainEnv(), resets={"interval": 12, "end": 0.7}).learn(90)  # 100 updates in steps 41 to 90
+    assert model._n_updates == 100
+    assert model._resets.done == [12, 24, 36]  # 70 % of 90 steps are over after 46 updates
+    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(50)._resets.done == [7, 14, 21]  # within rounds
+    assert make(ChainEnv()).learn(46)._resets.done == []
+    assert make(ChainEnv(), resets={"interval": 5, "end": 0.0}).learn(46)._resets.done == []
 
 
 def wait_for_a_longer_window(make):
@@ -287,19 +287,19 @@ def test_rounds_without_updates_keep_the_last_sound_model(make):
 
 def test_resets_are_postponed_not_lost():
     """Within the last tenth of one call of learn; the next call makes up for it."""
-    model = make_rainbow(ChainEnv(), resets={"interval": 110}).learn(100)
-    assert (model._n_updates, model._resets.done) == (120, [])
-    model.learn(100, reset_num_timesteps=False)
-    assert model._resets.done == [120, 230]
+    model = make_rainbow(ChainEnv(), resets={"interval": 30}).learn(60)
+    assert (model._n_updates, model._resets.done) == (40, [])
+    model.learn(40, reset_num_timesteps=False)
+    assert model._resets.done == [40, 70]
 
 
 def test_what_is_frozen_is_not_perturbed():
-    model = make_rainbow(ChainEnv(), resets={"interval": 30}, policy_kwargs={"net_arch": [32, 32]})
+    model = make_rainbow(ChainEnv(), resets={"interval": 6}, policy_kwargs={"net_arch": [32, 32]})
     frozen = [*model.q_net.features_extractor.parameters(), *model.q_net.head.value[0].parameters()]
     for parameter in frozen:
         parameter.requires_grad_(False)
     before = [parameter.clone() for parameter in frozen]
-    model.learn(80)
+    model.learn(50)
     assert len(model._resets.done) > 0 and all(th.equal(a, b) for a, b in zip(before, frozen, strict=True))
 
 

@@ -59,7 +59,7 @@ def angles(model):
     return coordinates(blocks.group, blocks.elements)[:, 0, 0].numpy(), places
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_ring_is_found(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
@@ -76,13 +76,14 @@ def test_the_ring_is_found(seed):
     assert abs(table[0] + table[1]) < 0.02 and abs(abs(table[0]) - 1) < 0.05
 
 
+@pytest.mark.slow
 def test_the_example_as_stated_collapses_and_that_is_told():
     with pytest.warns(UserWarning, match="states and actions are nearly constant.*collapsed"):
         train(0, 1500, parameterization="euler", whiten=False, aet_loss="distance", still_timesteps=0, learning_rate=1e-2)
 
 
 def test_the_same_seed_gives_the_same_representation():
-    one, two = train(3, 500), train(3, 500)
+    one, two = train(3, 450), train(3, 450)
     for (name, value), other in zip(one.policy.state_dict().items(), two.policy.state_dict().values(), strict=True):
         assert th.equal(value, other), name
 
@@ -91,7 +92,7 @@ def test_without_q_learning_the_head_stays_and_nothing_of_it_is_logged(make):
     model = make(ChainEnv(), td_coef=0.0, policy_kwargs={"projection": "own"})
     head = [p.clone() for p in model.policy.online.head.parameters()]
     encoder = [p.clone() for p in model.policy.online.features_extractor.parameters()]
-    model.learn(60)
+    model.learn(46)
     assert all(th.equal(p, q) for p, q in zip(model.policy.online.head.parameters(), head, strict=True))
     assert not any(th.equal(p, q) for p, q in zip(model.policy.online.features_extractor.parameters(), encoder, strict=True))
     logged = model.logger.name_to_value
@@ -138,13 +139,13 @@ def test_actions_that_do_not_depend_on_the_state():
     ids=str,
 )
 def test_the_switches_train_and_are_saved(make, settings, tmp_path):
-    model = make(ChainEnv(), **settings).learn(60)
+    model = make(ChainEnv(), **settings).learn(44)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
     assert loaded.policy.aet_loss == model.policy.aet_loss and loaded.td_coef == model.td_coef
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
-    loaded.learn(60)
+    loaded.learn(44)
 
 
 def test_what_is_not_legal():

@@ -134,7 +134,9 @@ def test_defaults_are_those_of_table_5(make):
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
     network = model.policy.online
     encoder = network.features_extractor
-    assert (network.n_atoms, network.net_arch, network.dueling, network.sigma_init) == (51, [256], True, 0.5)
+    head = network.head
+    assert (head.n_atoms, model.policy.net_arch, model.policy.sigma_init) == (51, [256], 0.5) and head.value is not None
+    assert (head.value[0].weight_sigma * 108**0.5 == 0.5).all()  # σ₀ over the square root of the inputs
     assert (str(encoder.group), encoder.n_blocks, encoder.features_dim) == ("SE(2)", 12, 108)
     assert sum(p.numel() for p in encoder.to_algebra.parameters()) == (3136 + 1) * 36
     assert model.policy.latent_model.transition[0].out_features == 256

@@ -31,7 +31,7 @@ def equal_states(a, b):
 @POLICIES
 @pytest.mark.parametrize("switches", [{}, {"policy_kwargs": {"noisy": False, "dueling": False}, "prediction_depth": 0}])
 def test_save_and_load(make, policy, env, switches, tmp_path):
-    model = make(env(), policy, **switches).learn(60)
+    model = make(env(), policy, **switches).learn(46)
     observations = np.concatenate([model.get_env().reset()]) if policy != "MultiInputPolicy" else model.get_env().reset()
     actions, _ = model.predict(observations, deterministic=True)
     model.save(tmp_path / "model.zip")
@@ -42,12 +42,12 @@ def test_save_and_load(make, policy, env, switches, tmp_path):
     assert a["param_groups"] == b["param_groups"]
     for key, state in a["state"].items():
         assert equal_states(state, b["state"][key])
-    loaded.learn(60)  # and on
+    loaded.learn(44)  # and on
     assert make.algorithm.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
 
 
 def test_save_and_load_by_file_object(make):
-    model = make(ChainEnv()).learn(60)
+    model = make(ChainEnv()).learn(46)
     file = io.BytesIO()
     model.save(file)
     model.save_replay_buffer(buffer := io.BytesIO())
@@ -56,7 +56,7 @@ def test_save_and_load_by_file_object(make):
     loaded = make.algorithm.load(file, env=ChainEnv())
     assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
     loaded.load_replay_buffer(buffer)
-    assert loaded.replay_buffer.size() == 60
+    assert loaded.replay_buffer.size() == 46
 
 
 @EITHER
@@ -84,7 +84,7 @@ def test_switches_can_be_changed_on_loading(make, tmp_path):
     make(ChainEnv()).save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
-    loaded.learn(60)
+    loaded.learn(46)
     assert loaded.replay_buffer.n_steps == 5
     for change in (
         {"symmetry_coef": 0.0},
@@ -92,9 +92,9 @@ def test_switches_can_be_changed_on_loading(make, tmp_path):
         {"prediction_depth": 0},
         {"aet_coef": 0.0, "double_q": False},
     ):
-        make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(60)
+        make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(46)
     make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
-    richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(60)
+    richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(46)
     assert loss_terms(richer, richer.replay_buffer.sample(8)).aet.shape == (8,)
 
 
@@ -108,22 +108,22 @@ def test_another_seed_may_be_given_on_loading(make, tmp_path):
 
 
 def test_a_target_that_is_no_copy_is_not_taken_for_one(make, tmp_path):
-    model = make(ChainEnv(), tau=0.005).learn(60)
+    model = make(ChainEnv(), tau=0.005).learn(46)
     assert not model.policy.target_encodes_as_online
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), tau=1.0)
     assert not loaded.policy.target_encodes_as_online
-    loaded.learn(60)
+    loaded.learn(46)
     assert loaded.policy.target_encodes_as_online
 
 
 def test_set_env_and_other_numbers_of_environments(make, tmp_path):
-    model = make(make_vec_env(ChainEnv, 2)).learn(60)
+    model = make(make_vec_env(ChainEnv, 2)).learn(46)
     model.set_env(make_vec_env(ChainEnv, 2))
     model.learn(60, reset_num_timesteps=False)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=make_vec_env(ChainEnv, 3))
-    loaded.learn(60)
+    loaded.learn(46)
     with pytest.raises(AssertionError, match="number of environments"):
         loaded.set_env(make_vec_env(ChainEnv, 2))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
@@ -131,7 +131,7 @@ def test_set_env_and_other_numbers_of_environments(make, tmp_path):
 
 
 def test_set_parameters(make, tmp_path):
-    model, other = make(ChainEnv()).learn(60), make(ChainEnv(), seed=1)
+    model, other = make(ChainEnv()).learn(46), make(ChainEnv(), seed=1)
     assert not equal_states(model.policy.state_dict(), other.policy.state_dict())
     other.set_parameters(model.get_parameters())
     assert equal_states(model.policy.state_dict(), other.policy.state_dict())
@@ -158,7 +158,7 @@ def test_set_parameters(make, tmp_path):
 
 @POLICIES
 def test_policies_alone(make, policy, env, tmp_path):
-    model = make(env(), policy).learn(60)
+    model = make(env(), policy).learn(46)
     obs = model.get_env().reset()
     expected = model.predict(obs, deterministic=True)[0]
     model.policy.save(str(tmp_path / "policy"))
@@ -173,14 +173,14 @@ def test_policies_alone(make, policy, env, tmp_path):
 
 def test_a_group_of_ones_own_is_saved(make, tmp_path):
     group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
-    model = make(ChainEnv(), policy_kwargs={"group": group}).learn(60)
+    model = make(ChainEnv(), policy_kwargs={"group": group}).learn(46)
     model.save(tmp_path / "model")
-    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv()).learn(60)
+    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv()).learn(46)
     assert str(loaded.policy.latent_model.group) == str(group)
 
 
 def test_replay_buffer_goes_with_the_model(make, tmp_path):
-    model = make(ChainEnv()).learn(60)
+    model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")
     old = model.replay_buffer
     model.load_replay_buffer(tmp_path / "buffer")
@@ -190,7 +190,7 @@ def test_replay_buffer_goes_with_the_model(make, tmp_path):
 
 
 KNOBS = {  # two resets after the file is written, one before; n and γ on their way
-    "resets": {"interval": 50, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 70},
+    "resets": {"interval": 30, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 45},
     "tau": 0.05,
     "policy_kwargs": {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}},
 }
@@ -202,15 +202,15 @@ KNOBS = {  # two resets after the file is written, one before; n and γ on their
     indirect=["make"],
 )
 def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, tmp_path):
-    """Saved after 120 of 240 steps, loaded in a new process, continued: the same parameters to the last bit."""
-    model = make(make_env(normalize), buffer_size=200, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
-    model.learn(240, callback=Save(tmp_path, at=120))
-    command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "120"]
+    """Saved after 80 of 160 steps, loaded in a new process, continued: the same parameters to the last bit."""
+    model = make(make_env(normalize), buffer_size=120, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
+    model.learn(160, callback=Save(tmp_path, at=80))
+    command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "80"]
     subprocess.run(command, check=True, timeout=120)
     continued = make.algorithm.load(tmp_path / "continued", device="cpu")
     halfway = make.algorithm.load(tmp_path / "model", device="cpu")
-    assert continued.num_timesteps == 240 and continued._n_updates == model._n_updates
-    assert continued._resets.done == model._resets.done == ([50, 100, 150] if knobs else [])
+    assert continued.num_timesteps == 160 and continued._n_updates == model._n_updates
+    assert continued._resets.done == model._resets.done == ([30, 60, 90] if knobs else [])
     assert halfway._resets.done == model._resets.done[:1]
     assert equal_states(model.policy.state_dict(), continued.policy.state_dict())
     assert not equal_states(model.policy.state_dict(), halfway.policy.state_dict())
@@ -265,7 +265,7 @@ def test_parameters_of_another_group(make, tmp_path):
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
 def test_checkpoints_cut_off_halfway(make, share, tmp_path):
-    model = make(ChainEnv()).learn(60)
+    model = make(ChainEnv()).learn(46)
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     for name in ("model.zip", "buffer.pkl"):
@@ -280,7 +280,7 @@ def test_checkpoints_cut_off_halfway(make, share, tmp_path):
 
 
 def test_replay_buffers_of_others(make, tmp_path):
-    model = make(ChainEnv()).learn(60)
+    model = make(ChainEnv()).learn(46)
     stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
     stock.save_replay_buffer(tmp_path / "stock")
     images = make(ImageEnv(), "CnnPolicy")
@@ -288,7 +288,7 @@ def test_replay_buffers_of_others(make, tmp_path):
     for name in ("stock", "images"):
         with pytest.raises(ValueError, match="expected a replay buffer of"):
             model.load_replay_buffer(tmp_path / name)
-        assert model.replay_buffer.size() == 60
+        assert model.replay_buffer.size() == 46
     for other in ({"prioritized_replay": False}, {"replay_buffer_kwargs": {"alpha": 0.9}}):
         make(ChainEnv(), **other).save_replay_buffer(tmp_path / "other")
         with pytest.raises(ValueError, match="expected a replay buffer of"):

@@ -24,9 +24,9 @@ def same(one, other):
 
 @pytest.mark.parametrize("giver, taker", [(QRDQN, RAINBOW), (RAINBOW, QRDQN), (QRDQN, QRDQN)])
 def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, taker):
-    old = giver(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60)
+    old = giver(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46)
     old.save(tmp_path / "old")
-    new = taker(ChainEnv(), policy_kwargs=WHITENED).learn(60)
+    new = taker(ChainEnv(), policy_kwargs=WHITENED).learn(46)
     head = {k: v.clone() for k, v in new.policy.online.head.state_dict().items()}
     rewards = [p.clone() for p in new.policy.latent_model.reward_net.parameters()]
     assert not same(states(old), states(new))
@@ -41,21 +41,19 @@ def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, ta
     )
     assert not any(p in new.policy.optimizer.state for m in representation(new.policy).values() for p in m.parameters())
     before = states(new)
-    new.learn(30, reset_num_timesteps=False)
+    new.learn(8, reset_num_timesteps=False)
     assert not same(before, states(new))  # it trains on
 
 
 def test_what_is_frozen_stays_through_training_saving_and_resets(make, tmp_path):
-    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60).save(tmp_path / "old")
-    model = make(ChainEnv(), policy_kwargs=WHITENED, resets={"interval": 30}).load_representation(
-        tmp_path / "old", freeze=True
-    )
+    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46).save(tmp_path / "old")
+    model = make(ChainEnv(), policy_kwargs=WHITENED, resets={"interval": 6}).load_representation(tmp_path / "old", freeze=True)
     before, head = states(model), model.policy.online.head.advantage[0].weight.clone()
-    model.learn(60)
+    model.learn(46)
     assert same(before, states(model)) and not th.equal(head, model.policy.online.head.advantage[0].weight)
     model.save(tmp_path / "new")
     loaded = make.algorithm.load(tmp_path / "new", env=ChainEnv())
-    loaded.learn(60)
+    loaded.learn(46)
     assert same(before, states(loaded)) and loaded._resets.done  # a reset leaves it, too
     assert not th.equal(head, loaded.policy.online.head.advantage[0].weight)
 
@@ -92,12 +90,12 @@ def test_another_kind_of_file(tmp_path):
 
 
 def test_what_was_frozen_can_be_let_go(make, tmp_path):
-    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(60).save(tmp_path / "old")
+    make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46).save(tmp_path / "old")
     model = make(ChainEnv(), policy_kwargs=WHITENED).load_representation(tmp_path / "old", freeze=True).learn(45)
     before = states(model)
     model.load_representation(tmp_path / "old", freeze=False)
     assert same(before, states(model)) and not model.representation_frozen
-    model.learn(60)
+    model.learn(46)
     assert not same(before, states(model))
 
 
@@ -111,7 +109,7 @@ def test_files_that_are_no_agents(tmp_path):
 
 def test_states_are_the_same_in_another_agent(tmp_path):
     """To the bit, wherever they are computed."""
-    old = QRDQN(ChainEnv(), seed=1).learn(60)
+    old = QRDQN(ChainEnv(), seed=1).learn(46)
     old.save(tmp_path / "old")
     new = RAINBOW(ChainEnv(), seed=5).load_representation(tmp_path / "old")
     observations = th.as_tensor(np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32))

@@ -13,7 +13,7 @@ from tests.toys import ChainEnv, ImageEnv
 def trained_model(make, **kwargs):
     policy_kwargs = {"noisy": False, **kwargs.pop("policy_kwargs", {})}
     settings = {"tau": 0.1, "exploration_final_eps": 0.1, **kwargs}
-    return make(ChainEnv(), policy_kwargs=policy_kwargs, **settings).learn(120)
+    return make(ChainEnv(), policy_kwargs=policy_kwargs, **settings).learn(60)
 
 
 @pytest.mark.parametrize("double_q", [True, False])
@@ -149,7 +149,7 @@ def test_gradients_are_clipped_together(make):
 
 
 def test_one_features_pass_serves_both(make, monkeypatch):
-    model = make(ImageEnv(), "CnnPolicy").learn(60)
+    model = make(ImageEnv(), "CnnPolicy").learn(44)
     calls = []
     network = type(model.policy.online)
     encode = network.encode
@@ -163,7 +163,7 @@ def test_one_features_pass_serves_both(make, monkeypatch):
 def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size):
     """In pieces or whole: the same losses, to rounding."""
     env = ImageEnv() if policy == "CnnPolicy" else SimpleMultiObsEnv(channel_last=True)
-    model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(60)
+    model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(44)
     samples, losses = model.replay_buffer.sample(8), []
     for at_a_time, n_pieces in ((1, 8), (3 * size, 3), (10**9, 1)):
         monkeypatch.setattr(objective, "_PIECE", at_a_time)
@@ -177,7 +177,7 @@ def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size
 
 
 def test_online_and_target_observations_are_augmented(make, monkeypatch):
-    model = make(ImageEnv(), "CnnPolicy").learn(60)
+    model = make(ImageEnv(), "CnnPolicy").learn(44)
     seen = []
     shift = objective.random_shift
     monkeypatch.setattr(objective, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))

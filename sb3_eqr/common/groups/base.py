@@ -52,10 +52,7 @@ class Group(ABC):
 
     @abstractmethod
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
-        """
-        :param batch: leading dimensions
-        :return: (\\*batch, \\*element_shape)
-        """
+        """The identity, (\\*batch, \\*element_shape)."""
 
     @property
     def for_actions(self) -> "Group":
@@ -66,7 +63,5 @@ class Group(ABC):
         return self
 
     def identity_params(self) -> th.Tensor:
-        """
-        :return: parameters of the identity, (num_params,)
-        """
+        """Parameters of the identity, (num_params,)."""
         return th.zeros(self.num_params)

@@ -184,11 +184,8 @@ class MatrixLieGroup(MatrixGroup):
             )
         self.generators = basis
         checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups
-        super().__init__(
-            f"MatrixLieGroup({basis.shape[0]}x{basis.shape[1]}x{basis.shape[2]}, {checksum:08x})",
-            basis.shape[0],
-            tuple(basis.shape[1:]),
-        )
+        d, m, _ = basis.shape
+        super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, (m, m))
         self._placed: dict[tuple[th.dtype, th.device], th.Tensor] = {}
 
     def element(self, params: th.Tensor) -> th.Tensor:

@@ -74,10 +74,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
             self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """
-        :param observations: preprocessed by SB3, (B, ...) or a dict of these
-        :return: the K elements, flattened, (B, features_dim)
-        """
+        """Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, features_dim)."""
         params = self.to_algebra(self.trunk(observations))  # (B, K * num_params)
         elements = self.group.element(params.unflatten(-1, (self.n_blocks, self.group.num_params)))
         return elements.flatten(1)  # (B, K * prod(element_shape))

@@ -57,10 +57,8 @@ class MLP(nn.Sequential):
     def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
         modules: list[nn.Module] = []
         for n_in, n_out in pairwise(sizes):
-            modules += [
-                nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init),
-                activation_fn(),
-            ]
+            layer = nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
+            modules += [layer, activation_fn()]
         super().__init__(*modules[:-1])
 
     def forward(self, inputs: th.Tensor, noisy: bool = False) -> th.Tensor:

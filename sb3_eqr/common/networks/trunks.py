@@ -32,9 +32,7 @@ class ConvTrunk(nn.Sequential):
 
     @staticmethod
     def smallest_image(layers: Sequence[Sequence[int]] = NATURE_LAYERS) -> int:
-        """
-        :return: the height and width that leave one pixel after the last layer
-        """
+        """The height and width that leave one pixel after the last layer."""
         size = 1
         for _, kernel_size, stride in reversed(layers):
             size = (size - 1) * stride + kernel_size
@@ -50,10 +48,7 @@ class ConvTrunk(nn.Sequential):
             self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: th.Tensor) -> th.Tensor:
-        """
-        :param images: (B, C, H, W), floating point
-        :return: (B, features)
-        """
+        """Images, (B, C, H, W), floating point, to features, (B, trunk_dim)."""
         # Channels last: the fastest layout for these convolutions on CPU, and no slower on GPU.
         return super().forward(images.contiguous(memory_format=th.channels_last))
 
@@ -90,10 +85,7 @@ class ResidualBlock(nn.Module):
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, images: th.Tensor) -> th.Tensor:
-        """
-        :param images: (B, C, H, W)
-        :return: the same shape
-        """
+        """Images to images, (B, C, H, W)."""
         return images + self.conv2(F.relu(self.conv1(F.relu(images)), inplace=True))
 
 
@@ -161,14 +153,9 @@ class ImageExtractor(BaseFeaturesExtractor):
 
 class ConvExtractor(ImageExtractor):
     """
-    :class:`~sb3_eqr.common.networks.trunks.ConvTrunk` as SB3 features extractor: the paper's convolutions, no linear layer.
+    The paper's convolutions: :class:`ConvTrunk`. The other parameters are those of :class:`ImageExtractor`.
 
-    :param observation_space: channels-first images, at least 36×36 with the default layers
-    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
-    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
-    :param layers: (filters, kernel size, stride) of each convolution
-    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
-    :raises ValueError: if the observations are no such images
+    :param layers: (filters, kernel size, stride) of each convolution; the default ones take images of at least 36×36
     """
 
     def __init__(
@@ -186,14 +173,9 @@ class ConvExtractor(ImageExtractor):
 
 class ImpalaExtractor(ImageExtractor):
     """
-    :class:`~sb3_eqr.common.networks.trunks.ImpalaTrunk` as SB3 features extractor.
+    The residual network of IMPALA: :class:`ImpalaTrunk`. The other parameters are those of :class:`ImageExtractor`.
 
-    :param observation_space: channels-first images
-    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
-    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
-    :param width_scale: multiplies the channels, > 0; 4 in BBF (https://arxiv.org/abs/2305.19452)
-    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
-    :raises ValueError: if the observations are no such images, or for a width of 0 or less
+    :param width_scale: multiplies the channels, ≥ 1/16; 4 in BBF (https://arxiv.org/abs/2305.19452)
     """
 
     def __init__(
@@ -214,10 +196,7 @@ TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {"nature": ConvExtractor, "impa
 
 
 def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
-    """
-    :param trunk: a features extractor, or one of the names in ``TRUNKS``
-    :raises ValueError: for an unknown name
-    """
+    """A features extractor, or the one of a name in ``TRUNKS``; raises ValueError for an unknown name."""
     if not isinstance(trunk, str):
         return trunk
     if trunk not in TRUNKS:
@@ -226,11 +205,7 @@ def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExt
 
 
 def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> type[BaseFeaturesExtractor]:
-    """
-    :param observation_space: any that SB3 supports
-    :param normalized_image: whether images are floats already
-    :return: the paper's convolutions for images, SB3's extractors otherwise
-    """
+    """The paper's convolutions for images (floats already if ``normalized_image``), SB3's extractors otherwise."""
     if isinstance(observation_space, spaces.Dict):
         return CombinedExtractor
     is_image = is_image_space(observation_space, normalized_image=normalized_image)

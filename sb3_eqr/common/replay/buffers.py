@@ -86,12 +86,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.timeouts = np.zeros(shape, dtype=np.float32)
         self._episode_starts = np.ones(n_envs, dtype=bool)
         available = np.inf if psutil is None else psutil.virtual_memory().available
-        needed = self._array_bytes()
-        if needed > available:
-            warnings.warn(
-                "This system does not have apparently enough memory to store the complete replay buffer "
-                f"{needed / 1e9:.2f}GB > {available / 1e9:.2f}GB"
-            )
+        if (needed := SequenceReplayBuffer.nbytes.fget(self)) > available:  # type: ignore[attr-defined]
+            warnings.warn(f"The replay buffer needs {needed / 1e9:.2f} GB, more than is free: {available / 1e9:.2f} GB.")
 
     def _check_arguments(self, frame_stack: int) -> None:
         check_number("n_steps", self.n_steps, 1, whole=True)
@@ -113,9 +109,6 @@ class SequenceReplayBuffer(ReplayBuffer):
     @property
     def nbytes(self) -> int:
         """Memory of everything stored, in bytes."""
-        return self._array_bytes()
-
-    def _array_bytes(self) -> int:
         arrays = (self.actions, self.rewards, self.dones, self.timeouts)
         return sum(store.nbytes for store in self._stores.values()) + sum(array.nbytes for array in arrays)
 
@@ -143,13 +136,13 @@ class SequenceReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        Store one transition per environment.
+        Store one transition per environment; every array is (n_envs, ...).
 
-        :param obs: s_t, (n_envs, *obs_shape)
-        :param next_obs: s_{t+1}, the terminal observation where the episode ended, (n_envs, *obs_shape)
-        :param action: (n_envs,)
-        :param reward: (n_envs,)
-        :param done: whether the episode ended, by a terminal state or a time-out, (n_envs,)
+        :param obs: s_t
+        :param next_obs: s_{t+1}, the terminal observation where the episode ended
+        :param action: a_t
+        :param reward: r_{t+1}
+        :param done: whether the episode ended, by a terminal state or a time-out
         :param infos: one dict per environment; ``TimeLimit.truncated`` marks a time-out
         """
         follows = np.ones(self.n_envs, dtype=bool)
@@ -199,11 +192,11 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def windows(self, starts: np.ndarray, envs: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
         """
-        The windows of one's own choice.
+        Windows of one's own choice.
 
         :param starts: steps, 0 is the oldest stored, below ``n_starts``, (B,)
         :param envs: environments, (B,)
-        :param env: normalises observations and one-step rewards, where given
+        :param env: as for :meth:`sample`
         """
         return self._windows(self._positions(starts), envs, env)
 
@@ -211,12 +204,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         return (starts + (self.pos if self.full else 0)) % self.buffer_size  # from the oldest on
 
     def _windows(self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SequenceReplayBufferSamples:
-        """
-        The windows that start at ``positions`` of ``envs``.
-
-        :param positions: (B,)
-        :param envs: (B,)
-        """
+        """The windows that start at ``positions``, (B,), of ``envs``, (B,)."""
         n, depth = self.n_steps, self.prediction_depth
         columns = envs[:, None]
         steps = np.arange(max(n, depth))
@@ -261,12 +249,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     def _observations(
         self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, following: bool = False
     ) -> PyTorchObs:
-        """
-        :param positions: of transitions, (...)
-        :param envs: (...), broadcast against ``positions``
-        :param following: the observations after these transitions, not the ones before
-        :return: (..., *obs_shape), or a dict of these
-        """
+        """As :meth:`FrameStore.observations`, normalised, on the device, one for each key of a dict."""
         found = {key: store.observations(positions, envs, following) for key, store in self._stores.items()}
         is_dict = isinstance(self.observation_space, spaces.Dict)
         observations = self._normalize_obs(found if is_dict else found[""], env)
@@ -365,9 +348,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         self._set_ages(self._tree_window - 1, self._tree_window, self._max_priority)
 
     def anneal_beta(self, progress_remaining: float) -> None:
-        """
-        :param progress_remaining: from 1 (start of training) to 0
-        """
+        """Move β to where it is with so much of training remaining, from 1 to 0."""
         self.beta = self.final_beta + (self.initial_beta - self.final_beta) * progress_remaining
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
@@ -382,9 +363,8 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
 
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
         """
-        :param indices: of the samples, (B,)
-        :param priorities: their new priorities p ≥ 0, (B,); entries that are not finite are passed over, and samples that
-            cannot be drawn any more
+        New priorities p ≥ 0 of samples, (B,), by their ``indices``, (B,). Those that are not finite are left out, and samples
+        that cannot be drawn any more.
         """
         scaled = (priorities.cpu().numpy().astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
         # A start that was overwritten, or has no whole window any more, stays at 0.
@@ -404,7 +384,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         self._tree_window = self.window
 
     def _set_ages(self, youngest: int, end: int, priority: float) -> None:
-        """Give one priority to the transitions of ages ``youngest`` to ``end`` - 1; the newest has age 0."""
+        """The priority of transitions of ages ``youngest`` to ``end`` - 1; the newest has age 0."""
         ages = np.arange(youngest, min(end, self.size()))
         positions = (self.pos - 1 - ages) % self.buffer_size
         leaves = (positions[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()

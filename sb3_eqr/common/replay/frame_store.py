@@ -40,9 +40,7 @@ class FrameStore:
         self._free = np.zeros(capacity, dtype=np.int32)
 
     def emptied(self) -> "FrameStore":
-        """
-        :return: an empty store of the same kind
-        """
+        """An empty store of the same kind."""
         return FrameStore(*self._ids.shape[:2], self.obs_shape, self._frames.dtype, self.n_stack)
 
     @property
@@ -85,10 +83,8 @@ class FrameStore:
 
     def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> np.ndarray:
         """
-        :param positions: of pairs, (...)
-        :param envs: (...), broadcast against ``positions``
-        :param following: the next observations, not the observations
-        :return: (..., *obs_shape), a copy
+        Observations, or those ``following``, of the pairs at ``positions``, (...), of ``envs``, broadcast against them: a
+        copy, (..., *obs_shape).
         """
         ids = self._ids[positions, envs, 1:] if following else self._ids[positions, envs, :-1]  # (..., n_stack)
         return self._frames[ids].reshape(*ids.shape[:-1], *self.obs_shape)
