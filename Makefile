@@ -7,7 +7,7 @@ CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
 
-.PHONY: demo test pytest slow format lint type commit-checks doc clean
+.PHONY: demo quick test pytest slow format lint type commit-checks doc clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -18,6 +18,10 @@ demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
 
 test: lint type pytest
+
+# The inner loop: groups, losses, layers, latent model, sum tree, buffers.
+quick: $(VENV)/installed
+	$(BIN)/python -m pytest tests/unit
 
 pytest: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2

@@ -1,7 +1,7 @@
 """EqR: equivariant representations for data-efficient reinforcement learning, on Stable-Baselines3."""
 
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
-from sb3_eqr.common.networks.group_encoder import GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.configurations import load_configuration
 from sb3_eqr.eqr_qrdqn import EqRQRDQN

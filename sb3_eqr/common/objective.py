@@ -9,7 +9,6 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
-from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 
@@ -63,7 +62,9 @@ class Objective:
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: LossCoefs) -> LossTerms:
         """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
-        state = self.policy.online.encode(observations)  # x₀, (B, D): TD and auxiliary losses meet here and nowhere else
+        state = self.policy.online.features_extractor(
+            observations
+        )  # x₀, (B, D): TD and auxiliary losses meet here and nowhere else
         td = priorities = q_values = None
         if coefs.td > 0:
             td, priorities, q_values = self._td_terms(samples, state)
@@ -77,9 +78,9 @@ class Objective:
         online, target = self.policy.online, self.policy.target
         with th.no_grad():
             next_observations = self.augment(samples.next_observations)
-            next_state = chooser_state = target.encode(next_observations)  # (B, D)
+            next_state = chooser_state = target.features_extractor(next_observations)  # (B, D)
             if self.double_q and not self.policy.target_encodes_as_online:
-                chooser_state = online.encode(next_observations)
+                chooser_state = online.features_extractor(next_observations)
             next_outputs = target.head(next_state, noisy=True)  # (B, N, A)
             chooser = online.head(chooser_state, noisy=True) if self.double_q else next_outputs
             next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
@@ -98,9 +99,11 @@ class Objective:
             return LatentLosses(None, None, None)
         with th.no_grad():
             shared = policy.target_encodes_as_online
-            target_states = (state.detach() if shared else policy.target.encode(observations))[:, None]  # x̄₀, (B, 1, D)
+            target_states = (state.detach() if shared else policy.target.features_extractor(observations))[
+                :, None
+            ]  # x̄₀, (B, 1, D)
             if coefs.aet > 0:
-                rollout = self._encode_rollout(policy.target, samples)  # x̄₁ ... x̄_M, (B, M, D)
+                rollout = self._encode_rollout(samples)  # x̄₁ ... x̄_M, (B, M, D)
                 target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         return policy.latent_model(
             state,
@@ -113,13 +116,14 @@ class Objective:
             policy.target_project,
         )
 
-    def _encode_rollout(self, network: EqRNetwork, samples: SequenceReplayBufferSamples) -> th.Tensor:
+    def _encode_rollout(self, samples: SequenceReplayBufferSamples) -> th.Tensor:
         """x̄₁ ... x̄_M, (B, M, D)."""
         assert samples.mask is not None and samples.rollout_observations is not None
         observations: Any = samples.rollout_observations
+        encoder = self.policy.target.features_extractor
         is_dict = isinstance(observations, dict)
         flat = {key: obs.flatten(0, 1) for key, obs in (observations if is_dict else {"": observations}).items()}
-        pieces = [network.encode(self.augment(piece if is_dict else piece[""])) for piece in in_pieces(flat)]
+        pieces = [encoder(self.augment(piece if is_dict else piece[""])) for piece in in_pieces(flat)]
         return th.cat(pieces).unflatten(0, samples.mask.shape)
 
 

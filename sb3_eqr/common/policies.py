@@ -15,10 +15,9 @@ from torch import nn
 
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import LatentModel, Projection
-from sb3_eqr.common.networks.group_encoder import DEFAULT_GROUP, GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import DEFAULT_GROUP, ConvTrunk, GroupFeaturesExtractor, ImageExtractor, find_trunk
 from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening
 from sb3_eqr.common.networks.q_networks import EqRNetwork
-from sb3_eqr.common.networks.trunks import ConvTrunk, ImageExtractor, find_trunk
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_names, check_number
 
@@ -48,7 +47,7 @@ class EqRPolicy(BasePolicy):
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``). ``None``: SB3's
         ``FlattenExtractor`` (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: its keyword arguments: those of
-        :class:`~sb3_eqr.common.networks.trunks.ConvExtractor` for "nature", of ``ImpalaExtractor`` beside it for "impala"
+        :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", of ``ImpalaExtractor`` beside it for "impala"
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate. The agent's constructor adds ``eps=1.5e-4``

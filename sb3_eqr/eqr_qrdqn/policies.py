@@ -9,8 +9,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_eqr.common.losses import quantile_huber_loss
+from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
-from sb3_eqr.common.networks.trunks import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.validation import check_number
 

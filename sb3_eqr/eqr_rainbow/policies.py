@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_eqr.common.losses import categorical_loss, categorical_projection
+from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
-from sb3_eqr.common.networks.trunks import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.validation import check_number
 

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.losses import normalized_distance
-from sb3_eqr.common.networks.group_encoder import GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import measures
 from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, split

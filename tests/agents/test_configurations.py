@@ -10,9 +10,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
-from sb3_eqr.common.networks.group_encoder import GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor, ImpalaTrunk
 from sb3_eqr.common.networks.layers import NoisyLinear
-from sb3_eqr.common.networks.trunks import ImpalaTrunk
+from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import configuration_files
 from tests.toys import ImageEnv
 
@@ -57,8 +57,10 @@ def test_the_full_agent_is_the_default_one():
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
     default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
     for key, value in load_configuration("eqr_rainbow").items():
-        if key not in ("policy_kwargs", "train_freq"):
+        if key not in ("policy_kwargs", "replay_buffer_kwargs", "train_freq"):
             assert getattr(default, key) == value, key
+    for key, value in load_configuration("eqr_rainbow")["replay_buffer_kwargs"].items():
+        assert getattr(default.replay_buffer, key) == value, key
     assert default.train_freq == named.train_freq
     for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
         found = getattr(default.policy, key)
@@ -90,7 +92,8 @@ def test_each_is_trained_as_the_table_says(name):
 
     # arguments arrived
     for key, value in kept.items():
-        assert (model.train_freq.frequency if key == "train_freq" else getattr(model, key)) == value
+        found = model.train_freq.frequency if key == "train_freq" else getattr(model, key)
+        assert found == (ResetSchedule.of(value) if key == "resets" else value)
     assert abs(model._n_updates - 24 * model.gradient_steps / model.train_freq.frequency) < 1
     assert isinstance(model.replay_buffer, PrioritizedSequenceReplayBuffer) == (name != "drq")
     encoder = model.policy.online.features_extractor

@@ -7,7 +7,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
-from sb3_eqr.common.networks.trunks import ConvExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
 from tests.toys import ChainEnv, ImageEnv
 

@@ -11,8 +11,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRRainbow
+from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
 from sb3_eqr.common.networks.layers import NoisyLinear
-from sb3_eqr.common.networks.trunks import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
@@ -251,7 +251,13 @@ def test_when_resets_happen(make):
     model = make(ChainEnv(), resets={"interval": 12, "end": 0.7}).learn(90)  # 100 updates in steps 41 to 90
     assert model._n_updates == 100
     assert model._resets.done == [12, 24, 36]  # 70 % of 90 steps are over after 46 updates
-    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(50)._resets.done == [7, 14, 21]  # within rounds
+    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)._resets.done == [
+        7,
+        14,
+        21,
+        28,
+        35,
+    ]  # within rounds
     assert make(ChainEnv()).learn(46)._resets.done == []
     assert make(ChainEnv(), resets={"interval": 5, "end": 0.0}).learn(46)._resets.done == []
 

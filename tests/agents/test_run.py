@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
-from sb3_eqr.common.networks.trunks import ConvExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor
 from tests.models import EITHER, N_ATOMS, SMALL
 from tests.toys import ChainEnv, ImageEnv
 
@@ -136,7 +136,7 @@ def test_defaults_are_those_of_table_5(make):
     encoder = network.features_extractor
     head = network.head
     assert (head.n_atoms, model.policy.net_arch, model.policy.sigma_init) == (51, [256], 0.5) and head.value is not None
-    assert (head.value[0].weight_sigma * 108**0.5 == 0.5).all()  # σ₀ over the square root of the inputs
+    assert head.value[0].weight_sigma[0, 0].item() == pytest.approx(0.5 / 108**0.5)  # σ₀ over the square root of the inputs
     assert (str(encoder.group), encoder.n_blocks, encoder.features_dim) == ("SE(2)", 12, 108)
     assert sum(p.numel() for p in encoder.to_algebra.parameters()) == (3136 + 1) * 36
     assert model.policy.latent_model.transition[0].out_features == 256

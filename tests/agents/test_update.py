@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
+from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common import objective
 from tests.models import MAKERS, loss_terms, train_on
 from tests.toys import ChainEnv, ImageEnv
@@ -151,12 +152,13 @@ def test_gradients_are_clipped_together(make):
 def test_one_features_pass_serves_both(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(44)
     calls = []
-    network = type(model.policy.online)
-    encode = network.encode
-    monkeypatch.setattr(network, "encode", lambda self, obs: calls.append((self, len(obs))) or encode(self, obs))
+    forward = GroupFeaturesExtractor.forward
+    watched = lambda self, obs: calls.append((self, len(obs))) or forward(self, obs)  # noqa: E731
+    monkeypatch.setattr(GroupFeaturesExtractor, "forward", watched)
     model.train(1, 8)
+    online, target = model.policy.online.features_extractor, model.policy.target.features_extractor
     # s_t with gradient, then what the target sees: s_{t+n} and M steps of rollout.
-    assert calls == [(model.policy.online, 8), (model.policy.target, 8), (model.policy.target, 8 * 2)]
+    assert calls == [(online, 8), (target, 8), (target, 8 * 2)]
 
 
 @pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])

@@ -42,7 +42,7 @@ PROMISES: dict[str, dict[str, Promise]] = {
     "losses.md": {
         "sb3_eqr/common/objective.py, Objective.__call__": Promise(
             code=(
-                "self.policy.online.encode(observations)",
+                "self.policy.online.features_extractor(observations)",
                 "loss = (samples.weights * sum(",
                 ").mean()",
                 "return LossTerms(",

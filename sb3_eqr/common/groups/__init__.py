@@ -4,7 +4,7 @@ Matrix Lie groups: what states and actions are made of (EqR, §3.1, §4 and appe
 A network predicts ``num_params`` numbers per block; :meth:`Group.element` turns them into a group element.
 Every method is stateless, differentiable and batched over all leading dimensions.
 
-``base`` says what a group is, ``rotations`` and ``matrix`` have the formulas, ``product`` makes groups from names.
+``base`` says what a group is, ``matrix`` has the formulas, ``product`` makes groups from names.
 """
 
 from sb3_eqr.common.groups.base import Group

@@ -7,8 +7,7 @@ from math import prod
 import torch as th
 
 from sb3_eqr.common.groups.base import Group
-from sb3_eqr.common.groups.matrix import GL, SE, SO, NoGroup, T
-from sb3_eqr.common.groups.rotations import ROTATIONS
+from sb3_eqr.common.groups.matrix import GL, ROTATIONS, SE, SO, NoGroup, T
 
 
 class ProductGroup(Group):

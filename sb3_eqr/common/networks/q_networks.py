@@ -41,10 +41,6 @@ class EqRNetwork(BasePolicy):
         """Features of observations, (B, *obs_shape) or a dict of these: (B, D)."""
         return self.extract_features(obs, self.features_extractor)
 
-    def encode(self, preprocessed_obs: PyTorchObs) -> th.Tensor:
-        """:meth:`features` of observations that have been through SB3's ``preprocess_obs``: (B, D)."""
-        return self.features_extractor(preprocessed_obs)
-
     @abstractmethod
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         """
