@@ -62,9 +62,8 @@ class Objective:
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: LossCoefs) -> LossTerms:
         """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
-        state = self.policy.online.features_extractor(
-            observations
-        )  # x₀, (B, D): TD and auxiliary losses meet here and nowhere else
+        # x₀, (B, D): TD and auxiliary losses meet here and nowhere else, so this is where their gradients can be weighed.
+        state = self.policy.online.features_extractor(observations)
         td = priorities = q_values = None
         if coefs.td > 0:
             td, priorities, q_values = self._td_terms(samples, state)

@@ -11,7 +11,7 @@ from sb3_eqr.common.groups import (
     guarded_inverse,
     make_group,
 )
-from sb3_eqr.common.groups.rotations import euler_rotation, exp_rotation
+from sb3_eqr.common.groups.matrix import euler_rotation, exp_rotation
 
 AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
 

@@ -4,8 +4,8 @@ import torch as th
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
+from sb3_eqr.common.networks.encoders import ConvTrunk
 from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening
-from sb3_eqr.common.networks.trunks import ConvTrunk
 
 
 def test_noise_is_factorised_and_fresh():
