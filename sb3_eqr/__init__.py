@@ -9,6 +9,8 @@ from sb3_eqr.eqr_rainbow import EqRRainbow
 
 __version__ = "0.1.0"
 
+AGENTS = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}  # by their names in RL Zoo and on the command line
+
 __all__ = [
     "EqRQRDQN",
     "EqRRainbow",

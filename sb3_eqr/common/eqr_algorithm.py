@@ -145,7 +145,6 @@ class EqRAlgorithm(SafeFiles):
         :raises TypeError: for an argument that there is not, with the nearest one that there is
         :raises AssertionError: if the action space is not Discrete (as SB3)
         """
-        del optimize_memory_usage  # kept so that SB3's arguments fit
         # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
         policy_kwargs = dict(policy_kwargs or {})
         policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
@@ -213,8 +212,8 @@ class EqRAlgorithm(SafeFiles):
         validation.check_same_parameters(self.policy_description, saved)
         self._convert_train_freq()
         self._create_aliases()
-        epsilons = self.exploration_initial_eps, self.exploration_final_eps
-        self.exploration_schedule = LinearSchedule(*epsilons, self.exploration_fraction)
+        start, end = self.exploration_initial_eps, self.exploration_final_eps
+        self.exploration_schedule = LinearSchedule(start, end, self.exploration_fraction)
         if self.representation_frozen:
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
@@ -282,7 +281,7 @@ class EqRAlgorithm(SafeFiles):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
-        validation.check_finite("observation", self._last_obs, self.num_timesteps)  # before the first step
+        validation.check_finite("observation", self._last_obs, self.num_timesteps)
         return result
 
     def _store_transition(
@@ -344,7 +343,8 @@ class EqRAlgorithm(SafeFiles):
             else:
                 terms = self.objective(samples, coefs)
                 terms.loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(self._trained, th.inf if self.max_grad_norm is None else self.max_grad_norm)
+            max_norm = th.inf if self.max_grad_norm is None else self.max_grad_norm
+            grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
             optimizer.step()
             self._n_updates += 1
             policy.target_is_copy = False

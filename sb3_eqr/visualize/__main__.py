@@ -9,10 +9,11 @@ import gymnasium as gym
 from matplotlib.figure import Figure
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import Play, encode, play
-from sb3_eqr.visualize.loading import ALGORITHMS, action_names, factor_names, load_model, make_env, parse_kwargs
+from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictures
 from sb3_eqr.visualize.tables import all_tables, write_tables
 from sb3_eqr.visualize.tables import factor_names as all_names
@@ -29,7 +30,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file that an agent's save wrote")
     parser.add_argument("--env", help="of gymnasium (default: what RL Zoo wrote beside MODEL)")
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="of the environment's constructor")
-    parser.add_argument("--algo", choices=list(ALGORITHMS), help="(default: found out from MODEL)")
+    parser.add_argument("--algo", choices=list(AGENTS), help="(default: found out from MODEL)")
     parser.add_argument("--steps", type=int, default=1000, help="of play, over all environments (default: 1000)")
     parser.add_argument("--depth", type=int, help=f"how many steps to predict (default: the agent's, {DEPTH} where it has 0)")
     parser.add_argument("--n-envs", type=int, default=1, help="number of environments (default: 1)")

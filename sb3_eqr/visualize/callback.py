@@ -11,6 +11,7 @@ from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.latents import check_agent, encode, replayed
+from sb3_eqr.visualize.measures import mean_of_known
 
 NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
 EXCLUDED = (*NO_PICTURES.values(), "log")  # the name of HumanOutputFormat's file
@@ -102,13 +103,8 @@ def scalars(found: Diagnostics) -> dict[str, float]:
         "effective_rank": found.collapse.effective_rank,
         "spread": found.collapse.spread,
         "dead_units": found.collapse.dead_units,
-        "specificity": _mean(blocks.specificity),
-        "redundancy": _mean(blocks.redundancy[~np.eye(len(blocks.redundancy), dtype=bool)]),
+        "specificity": mean_of_known(blocks.specificity),
+        "redundancy": mean_of_known(blocks.redundancy[~np.eye(len(blocks.redundancy), dtype=bool)]),
         "symmetry_distance": np.nan if found.action_symmetry is None else found.action_symmetry.distance,
-        "reward_explained": _mean(found.rewards.explained),
+        "reward_explained": mean_of_known(found.rewards.explained),
     }
-
-
-def _mean(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) > 0 else np.nan

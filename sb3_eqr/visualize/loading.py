@@ -14,18 +14,16 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_eqr.envs
-from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.save_util import is_whole_model
 from sb3_eqr.visualize.latents import FACTOR_KEYS
-
-ALGORITHMS: dict[str, type[EqRAlgorithm]] = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}
 
 
 def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto") -> EqRAlgorithm:
     """
     :param path: of a file that ``save`` wrote
-    :param algo: one of ``ALGORITHMS``; found out where not given
+    :param algo: one of ``AGENTS``; found out where not given
     :param device: of PyTorch
     :raises ValueError: if there is no such file, or it holds something else
     """
@@ -34,7 +32,7 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
     if not is_whole_model(path):
         raise ValueError(f"{path}: expected a whole file of an agent's save, found one that is cut off or something else")
     try:
-        return ALGORITHMS[algo or find_algorithm(path)].load(path, device=device)
+        return AGENTS[algo or find_algorithm(path)].load(path, device=device)
     except (TypeError, RuntimeError) as error:
         raise ValueError(f"{path}: expected an agent saved by this version of sb3_eqr and by --algo: {error}") from error
 
@@ -44,17 +42,17 @@ def find_algorithm(path: pathlib.Path) -> str:
     By the module of the policy's class, which SB3 writes in plain text: nothing is unpickled.
 
     :param path: of a whole file
-    :return: one of ``ALGORITHMS``
+    :return: one of ``AGENTS``
     :raises ValueError: if the policy is not one of this package's
     """
     with zipfile.ZipFile(path) as archive:
         data = json.loads(archive.read("data"))
     module = str(data.get("policy_class", {}).get("__module__"))
-    for name in ALGORITHMS:
+    for name in AGENTS:
         if module.startswith(f"sb3_eqr.{name}."):
             return name
     raise ValueError(
-        f"{path}: expected an agent of {' or '.join(kind.__name__ for kind in ALGORITHMS.values())}, found one whose policy "
+        f"{path}: expected an agent of {' or '.join(kind.__name__ for kind in AGENTS.values())}, found one whose policy "
         f"is of {module}. Pass --algo if that is a class of your own for one of them."
     )
 

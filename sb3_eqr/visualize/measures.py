@@ -263,3 +263,9 @@ def effective_rank(values: np.ndarray, size: float = 0.0) -> float:
         return 0.0
     p = counted / counted.sum()
     return float(np.exp(-(p * np.log(np.where(p > 0, p, 1))).sum()))
+
+
+def mean_of_known(values: np.ndarray) -> float:
+    """The mean of the values that are not NaN; NaN if there are none, without NumPy's warning."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) > 0 else np.nan

@@ -9,6 +9,7 @@ import pandas as pd
 from sb3_eqr.common.save_util import atomic_write
 from sb3_eqr.visualize.diagnostics import Diagnostics, skill_and_gain
 from sb3_eqr.visualize.findings import ActionSymmetry
+from sb3_eqr.visualize.measures import mean_of_known
 
 
 def all_tables(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequence[str] = ()) -> dict[str, pd.DataFrame]:
@@ -128,15 +129,10 @@ def _summary(diagnostics: Diagnostics) -> pd.DataFrame:
         ("dimensions", diagnostics.collapse.dimensions),
         ("spread", diagnostics.collapse.spread),
         ("dead_units", diagnostics.collapse.dead_units),
-        ("specificity", _mean(diagnostics.disentanglement.specificity)),
-        ("redundancy", _mean(redundancy)),
-        ("gap", np.nan if diagnostics.disentanglement.gap is None else _mean(diagnostics.disentanglement.gap)),
-        ("reward_explained", _mean(diagnostics.rewards.explained)),
+        ("specificity", mean_of_known(diagnostics.disentanglement.specificity)),
+        ("redundancy", mean_of_known(redundancy)),
+        ("gap", np.nan if diagnostics.disentanglement.gap is None else mean_of_known(diagnostics.disentanglement.gap)),
+        ("reward_explained", mean_of_known(diagnostics.rewards.explained)),
         ("windows", int(diagnostics.loss.n_windows[0])),
     ]
     return pd.DataFrame(rows, columns=["measure", "value"])
-
-
-def _mean(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else np.nan

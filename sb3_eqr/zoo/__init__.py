@@ -12,6 +12,7 @@ try:
 except ImportError as error:
     raise ImportError(f'sb3_eqr.zoo needs RL Zoo, found: {error}. pip install "sb3-eqr[zoo]"') from None
 
-from sb3_eqr.zoo.registration import AGENTS, register
+from sb3_eqr import AGENTS
+from sb3_eqr.zoo.registration import register
 
 __all__ = ["AGENTS", "register"]

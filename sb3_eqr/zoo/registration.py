@@ -6,11 +6,8 @@ from typing import Any
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, envs
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr import AGENTS, envs
 from sb3_eqr.zoo.search import convert_eqr_params, make_sampler
-
-AGENTS: dict[str, type[EqRAlgorithm]] = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}
 
 
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:

@@ -19,7 +19,7 @@ def continued(model):
     th.manual_seed(0)
     model.replay_buffer._tree.set(th.arange(40).numpy(), 1.0)
     model.set_random_seed(0)
-    model.train(5, 8)
+    model.train(3, 8)
     return list(model.policy.parameters())
 
 
@@ -27,7 +27,7 @@ def continued(model):
     "copied", [deepcopy, lambda m: pickle.loads(pickle.dumps(m)), lambda m: cloudpickle.loads(cloudpickle.dumps(m))]
 )
 def test_a_model_can_be_copied_while_it_trains(make, copied):
-    model = make(ChainEnv(), policy_kwargs={"projection": "own", "aet_loss": "contrastive"}).learn(60)
+    model = make(ChainEnv(), policy_kwargs={"projection": "own", "aet_loss": "contrastive"}).learn(46)
     copy = copied(model)
     before = [p.clone() for p in copy.policy.parameters()]
     ours = continued(model)

@@ -44,6 +44,7 @@ def test_the_replay_buffer_holds_every_sequence_once():
     assert buffer.rewards.sum() == 1 and buffer.dones.sum() == 2**5
 
 
+@pytest.mark.slow
 def test_prioritised_replay_needs_fewer_updates():
     """`python examples/blind_cliffwalk.py` does this with 10 seeds and longer walks: docs/results/cliffwalk.md."""
     uniform, prioritized = (np.median([updates_needed(6, seed, way) for seed in range(5)]) for way in (False, True))

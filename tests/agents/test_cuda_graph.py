@@ -23,12 +23,12 @@ GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 
 @EITHER
 def test_without_a_gpu_updates_are_eager_and_a_warning_says_why(make):
-    eager = make(ChainEnv()).learn(60)
+    eager = make(ChainEnv()).learn(46)
     with pytest.warns(
         UserWarning, match="cuda_graph: updates run eagerly, because a CUDA graph needs a GPU.* 'cpu'"
     ) as caught:
-        asked = make(ChainEnv(), cuda_graph=True).learn(60)
-    assert len([w for w in caught if "cuda_graph" in str(w.message)]) == 1 and asked._n_updates == 40
+        asked = make(ChainEnv(), cuda_graph=True).learn(46)
+    assert len([w for w in caught if "cuda_graph" in str(w.message)]) == 1 and asked._n_updates == 12
     for (name, a), (_, b) in zip(eager.policy.state_dict().items(), asked.policy.state_dict().items(), strict=True):
         assert th.equal(a, b), name
     with pytest.warns(UserWarning, match="cuda_graph"):

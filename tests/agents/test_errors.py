@@ -188,7 +188,7 @@ def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, grad
     assert max(p.abs().max().item() for p in model.policy.parameters()) < 100
     assert all(th.isfinite(term).all() for term in loss_terms(model, model.replay_buffer.sample(8)))
     model.lr_schedule = lambda progress: 1e-4
-    model.learn(50, reset_num_timesteps=False)
+    model.learn(5, reset_num_timesteps=False)
 
 
 def test_moving_n_beyond_the_buffer_is_refused(make):

@@ -134,7 +134,7 @@ def test_noise_explores_in_eval_mode_and_differs_from_step_to_step():
 
 
 def test_acting_with_the_target_network():
-    model = make_rainbow(ChainEnv(), tau=0.003, policy_kwargs={"act_with_target": True}).learn(200)
+    model = make_rainbow(ChainEnv(), tau=0.003, learning_rate=1e-3, policy_kwargs={"act_with_target": True}).learn(80)
     obs = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
     with th.no_grad():
         online, target = (net(th.as_tensor(obs)).argmax(dim=1).numpy() for net in (model.q_net, model.q_net_target))

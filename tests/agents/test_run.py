@@ -37,7 +37,7 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
     envs = {"MlpPolicy": ChainEnv, "CnnPolicy": ImageEnv, "MultiInputPolicy": SimpleMultiObsEnv}
     model = make(envs[policy](), policy)
     before = deepcopy(model.policy.state_dict())
-    model.learn(60)
+    model.learn(46)
     after = model.policy.state_dict()
     frozen = [n for n, p in model.policy.named_parameters() if p.requires_grad and th.equal(before[n], after[n])]
     assert frozen == []
@@ -75,7 +75,7 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
     ids=lambda kwargs: re.sub(" at 0x\\w+", "", str(kwargs)),
 )
 def test_every_switch_runs(make, kwargs):
-    model = make(ChainEnv(), **kwargs).learn(80)
+    model = make(ChainEnv(), **kwargs).learn(62)
     assert model._n_updates > 0
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
@@ -104,7 +104,7 @@ def test_several_environments(make, n_envs):
 def test_the_callers_dictionaries_are_left_alone(make):
     policy_kwargs, buffer_kwargs = {"net_arch": [16]}, {"handle_timeout_termination": False}
     model = make.algorithm("MlpPolicy", ChainEnv(), **SMALL, policy_kwargs=policy_kwargs, replay_buffer_kwargs=buffer_kwargs)
-    model.learn(60)
+    model.learn(46)
     assert policy_kwargs == {"net_arch": [16]} and buffer_kwargs == {"handle_timeout_termination": False}
     assert model.policy.optimizer.defaults["eps"] == 1.5e-4  # Table 5
     for name, expected in (("AdamW", 1.5e-4), (th.optim.Adam, 1.5e-4), ("RAdam", 1e-8)):  # RAdam: torch's own
@@ -148,7 +148,7 @@ def test_defaults_are_those_of_table_5(make):
 
 @pytest.mark.parametrize("shape", [(40, 36, 3), (3, 40, 36)])
 def test_images_channels_first_and_last(make, shape):
-    model = make(ImageEnv(shape), "CnnPolicy").learn(60)
+    model = make(ImageEnv(shape), "CnnPolicy").learn(46)
     obs = model.get_env().reset()
     assert obs.shape == (1, 3, 40, 36)
     raw = ImageEnv(shape).observation_space.sample()
@@ -169,7 +169,7 @@ def test_group_keywords_reach_a_given_group_encoder(make):
 
 def test_images_that_are_floats_already(make):
     env = ImageEnv((3, 40, 36), dtype=np.float32)
-    model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(60)
+    model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(46)
     assert model.objective.augment.image_keys == [""]  # augmented like the others
     policy_kwargs = {"normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
     encoder = make(env, "CnnPolicy", policy_kwargs=policy_kwargs).policy.online.features_extractor
@@ -206,12 +206,12 @@ def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
 
 def test_a_custom_extractor_becomes_the_trunk(make):
     kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(60)
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(46)
     encoder = model.policy.online.features_extractor
     assert isinstance(encoder, GroupFeaturesExtractor) and isinstance(encoder.trunk, TinyExtractor)
     assert encoder.to_algebra.in_features == 7
     assert not model.policy.target_encodes_as_online  # batch norm: online features in train mode are no target features
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(60)
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(46)
     assert model.policy.online.features_extractor.to_algebra.in_features == 512
 
 
@@ -261,7 +261,7 @@ def test_multi_discrete_and_multi_binary_observations(make, space):
 def test_dict_observations_are_augmented_where_they_are_images(make):
     model = make(SimpleMultiObsEnv(channel_last=True), "MultiInputPolicy")
     assert model.objective.augment.image_keys == ["img"]
-    model.learn(60)
+    model.learn(46)
     obs = {"img": th.randint(0, 256, (4, 1, 36, 36), dtype=th.uint8), "vec": th.rand(4, 5)}
     augmented = model.objective.augment(obs)
     assert th.equal(augmented["vec"], obs["vec"]) and not th.allclose(augmented["img"] * 255, obs["img"].float(), atol=0.5)
@@ -364,7 +364,7 @@ def test_beta_and_counters(make):
 
 
 def test_a_schedule_may_move_n_and_gamma(make):
-    model = make(ChainEnv()).learn(60)
+    model = make(ChainEnv()).learn(46)
     model.n_steps, model.gamma = 2, 0.5
     model.train(1, 8)
     assert model.replay_buffer.n_steps == 2
@@ -442,14 +442,14 @@ def test_eval_and_checkpoint_callbacks(make, tmp_path):
     env = VecNormalize(make_vec_env(ChainEnv))
     eval_env = VecNormalize(make_vec_env(ChainEnv), training=False)
     callbacks[0].eval_env = eval_env
-    make(env).learn(120, callback=callbacks)
+    make(env, gradient_steps=1).learn(105, callback=callbacks)
     made = {path.name for path in tmp_path.iterdir()}
     assert {"best_model.zip", "rl_model_50_steps.zip", "rl_model_replay_buffer_100_steps.pkl"} <= made
     assert not any("partial" in name for name in made)
     model = make.algorithm.load(tmp_path / "rl_model_100_steps", env=env)
     model.load_replay_buffer(tmp_path / "rl_model_replay_buffer_100_steps")
     assert model.replay_buffer.size() == 99
-    model.learn(30, reset_num_timesteps=False)
+    model.learn(5, reset_num_timesteps=False)
 
 
 # ---------------------------------------------------------------------------------------------- logger
