@@ -3,6 +3,7 @@
 import json
 import pathlib
 import sys
+from collections import deque
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,7 @@ from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.benchmark.plan import State, plan_runs, read_plan, state_of, write_plan
 from sb3_eqr.benchmark.run import Settings
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
+from sb3_eqr.benchmark.training import execute
 
 FAST = (
     "{policy: MlpPolicy, n_timesteps: 9, learning_starts: 9, batch_size: 4, buffer_size: 99, policy_kwargs: {net_arch: [8]}}"
@@ -82,9 +84,12 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     assert code == 0 and "8 of 8 runs are finished already." in out.out
 
 
-def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr, cluster):
-    broken = FAST.replace("batch_size: 4", "batch_size: 4, max_grad_norm: wrong")
-    pathlib.Path("broken.yml").write_text(f"CartPole-v1: {broken}\n")
+BROKEN = f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 4, max_grad_norm: wrong')}\n"
+
+
+@pytest.mark.slow
+def test_ray_tries_a_run_that_crashes_twice_while_the_others_go_on(files, sb3_eqr, cluster):
+    pathlib.Path("broken.yml").write_text(BROKEN)
     line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
     line += f" --address {cluster}"
     code, out = sb3_eqr(line)
@@ -97,6 +102,54 @@ def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(f
     pathlib.Path("broken.yml").write_text(pathlib.Path("fast.yml").read_text())
     code, out = sb3_eqr(line)
     assert code == 0 and [state_of(run).name for run in read_plan(pathlib.Path("b"))] == ["done", "done"]
+
+
+class Crash(RayError):
+    def __init__(self, cause):
+        self.cause = cause
+
+
+class InOneProcess:
+    """In the place of Ray: a run is done in this process when its outcome is asked for."""
+
+    exceptions = SimpleNamespace(RayError=RayError)
+
+    def remote(self, run, settings):
+        return lambda: execute(run, settings)
+
+    def wait(self, references, timeout):
+        return references[:1], references[1:]
+
+    def get(self, reference):
+        try:
+            return reference()
+        except ValueError as error:
+            raise Crash(error) from error
+
+
+def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr, capfd):
+    (files / "broken.yml").write_text(BROKEN)
+    suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
+
+    def dispatch():
+        runs = plan_runs(files / "b", suite, ["dqn:broken.yml", "dqn:fast.yml"], 1)
+        write_plan(files / "b", suite, runs)
+        states, ray = [state_of(run) for run in runs], InOneProcess()
+        waiting = deque(index for index, state in enumerate(states) if state.name != "done")
+        failed = runner.Dispatcher(ray, ray, runs, states, Settings(), Console()).finish(waiting)
+        return [run.agent.name for run in failed], capfd.readouterr().out
+
+    failed, out = dispatch()
+    assert failed == ["dqn:broken"]
+    assert out.count("dqn:broken, CartPole, seed 0: crashed (ValueError") == 2
+    assert "dqn:fast, CartPole, seed 0: finished" in out
+    assert json.loads((files / "b/runs/dqn-fast/CartPole/0/result.json").read_text())["attempts"] == 1
+    _, shown = sb3_eqr("status b")
+    assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in shown.out
+    (files / "broken.yml").write_text((files / "fast.yml").read_text())
+    failed, out = dispatch()
+    assert failed == [] and "dqn:broken, CartPole, seed 0: finished" in out and "dqn:fast, CartPole, seed 0" not in out
+    assert [state_of(run).name for run in read_plan(files / "b")] == ["done", "done"]
 
 
 RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
@@ -136,9 +189,13 @@ def test_wrong_use_is_told(files, sb3_eqr, line, message):
     assert code == 2 and message in out.err and "Traceback" not in out.err
 
 
+@pytest.mark.slow
 def test_runs_that_no_machine_can_hold_are_told(files, sb3_eqr, cluster):
     code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --address {cluster}")
     assert code == 2 and "--cpus-per-run: expected at most the 1 CPUs of the largest machine, found 2" in out.err
+
+
+def test_a_cluster_that_does_not_answer_is_told(files, sb3_eqr):
     code, out = sb3_eqr(f"{RUN} --seeds 1 --address 127.0.0.1:1")
     assert code == 2 and "127.0.0.1:1" in out.err
 
@@ -225,11 +282,6 @@ def test_a_replay_buffer_is_no_larger_than_the_run(files):
     suite = choose(load_suite("smoke"), None, None)
     runs = plan_runs(files / "b", suite, ["qrdqn", "eqr_qrdqn", "dqn:fast.yml", "ppo"], 1)
     assert [run.entry.get("buffer_size") for run in runs] == [3_000, 3_000, 99, None]
-
-
-class Crash(RayError):
-    def __init__(self, cause):
-        self.cause = cause
 
 
 @pytest.mark.parametrize("cause", [AssertionError(), ValueError("[/tmp/x] [cpu]\nthe [last] line"), None])

@@ -1,6 +1,7 @@
 """Every entry of every hyperparameter file builds its agent, by RL Zoo's own hands, and is trained by it."""
 
 import argparse
+import pathlib
 
 import pytest
 import yaml
@@ -28,6 +29,21 @@ CASES = [  # what stands for several environments is one object of YAML, and bui
 ]
 
 
+class Manager(ExperimentManager):
+    """RL Zoo's, which builds Atari's environment once for all entries that ask for the same: ALE takes long to load a game."""
+
+    built = {}
+
+    def create_envs(self, n_envs, *args, **kwargs):
+        if not self.env_name.gym_id.endswith("NoFrameskip-v4"):
+            return super().create_envs(n_envs, *args, **kwargs)
+        entry = yaml.safe_load(pathlib.Path(self.config).read_text(encoding="utf-8"))["atari"]
+        asked = n_envs, *(str(entry.get(key)) for key in ("env_wrapper", "frame_stack", "normalize", "vec_env_wrapper"))
+        if asked not in self.built:
+            self.built[asked] = super().create_envs(n_envs, *args, **kwargs)
+        return self.built[asked]
+
+
 def algorithm_of(name):
     return name.removeprefix("stock/") if name.startswith("stock/") else name if name == "eqr_qrdqn" else "eqr_rainbow"
 
@@ -45,9 +61,7 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
     zoo.register()
     path, algo = configuration_files()[name], algorithm_of(name)
     env_id = "PongNoFrameskip-v4" if entry == "atari" else entry
-    manager = ExperimentManager(
-        argparse.Namespace(), algo, env_id, str(tmp_path), eval_freq=-1, config=str(path), device="cpu"
-    )
+    manager = Manager(argparse.Namespace(), algo, env_id, str(tmp_path), eval_freq=-1, config=str(path), device="cpu")
     model, _ = manager.setup_experiment()
     assert type(model) is ALGOS[algo]
     written = yaml.safe_load(path.read_text(encoding="utf-8"))[entry]
@@ -58,10 +72,10 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
     if "env_wrapper" in written:
         assert model.observation_space.dtype == "uint8"
         assert model.observation_space.shape[1:] == ((84, 84) if entry == "atari" else (10, 10))
-    # It can act and be trained as it stands.
+    # It can act and be trained, on a batch that takes less time.
     model.learning_starts = 0
-    model.train_freq = 40
+    model.train_freq = 24  # the longest n of these files is 20
     model._convert_train_freq()
-    model.gradient_steps = 1
-    model.learn(40)
+    model.batch_size, model.gradient_steps = 4, 1
+    model.learn(24)
     assert model._n_updates == 1
