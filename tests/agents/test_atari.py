@@ -243,15 +243,16 @@ def test_games_in_a_batch_are_those_of_the_wrappers(monkeypatch, game, max_steps
 
 def test_a_batch_begins_with_one_to_thirty_noops(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 1)
-    batch = AtariBatch("Pong", 8, seed=0)
+    batch = AtariBatch("Pong", 4, seed=0)
     batch.reset()
     drawn = [*batch.n_noops]
-    for _ in range(30):
-        batch.send(np.zeros(8, dtype=int))
+    for _ in range(20):
+        batch.send(np.zeros(4, dtype=int))
         assert batch.receive()[2].all()
         drawn += [*batch.n_noops]
-    assert set(drawn) == set(range(1, 31))
-    assert np.mean(drawn) == pytest.approx(15.5, abs=2)
+    # Of 84 draws from 1 ... 30: all are legal, the ends are reached to within 2, the mean is off by less than two standard errors.
+    assert set(drawn) <= set(range(1, 31)) and min(drawn) <= 3 and max(drawn) >= 28
+    assert np.mean(drawn) == pytest.approx(15.5, abs=1.9)
 
 
 def test_the_seed_of_a_batch_is_that_of_its_first_game():

@@ -149,7 +149,7 @@ def test_acting_with_the_target_network():
 
 def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
     """Every draw is watched: its n, its γ, and whether the returns in it are those of that n and γ."""
-    resets = {"initial_n_steps": 8, "initial_gamma": 0.5, "annealing_steps": 20, "interval": 40}
+    resets = {"initial_n_steps": 8, "initial_gamma": 0.5, "annealing_steps": 10, "interval": 20}
     model = make(ChainEnv(), n_steps=2, gamma=0.95, resets=resets, seed=1)
     buffer, used = model.replay_buffer, []
     windows = buffer._windows
@@ -171,14 +171,13 @@ def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
         return samples
 
     monkeypatch.setattr(buffer, "_windows", watched)
-    model.learn(120)
-    assert model._resets.done == [40, 80, 120]
+    model.learn(80)
+    assert model._resets.done == [20, 40, 60]
     assert [update for update, _, _ in used] == list(range(model._n_updates))
     for update, n_steps, gamma in used:
-        share = min(update % 40, 20) / 20 if update < 160 else 1.0
-        if update < 160:
-            assert n_steps == round(8 * 0.25**share)
-            assert gamma == pytest.approx(1 - 0.5 * 0.1**share)
+        share = min(update % 20, 10) / 10
+        assert n_steps == round(8 * 0.25**share)
+        assert gamma == pytest.approx(1 - 0.5 * 0.1**share)
     assert {n for _, n, _ in used} == {8, 7, 6, 5, 4, 3, 2}
 
 
@@ -189,7 +188,7 @@ def test_constant_n_and_gamma_are_left_alone(make):
 
 def test_importance_weights_of_bbf(make):
     """β stays at 1/2: weights are 1/√P over their maximum."""
-    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.5, "final_beta": 0.5}).learn(120)
+    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.5, "final_beta": 0.5}).learn(50)
     assert model.replay_buffer.beta == 0.5
     samples = model.replay_buffer.sample(64)
     found = model.replay_buffer._tree.get(samples.indices)
@@ -198,7 +197,7 @@ def test_importance_weights_of_bbf(make):
 
 
 def test_beta_may_fall(make):
-    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.8, "final_beta": 0.2}).learn(100)
+    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.8, "final_beta": 0.2}).learn(50)
     assert model.replay_buffer.beta == pytest.approx(0.2)
     model._current_progress_remaining = 0.5
     model.train(1, 8)
