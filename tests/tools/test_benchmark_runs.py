@@ -249,8 +249,8 @@ def test_atari_is_evaluated_on_whole_games_as_the_paper_does():
 
 def test_an_endless_atari_game_is_counted_when_its_steps_are_over(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 30)
-    _, lengths = evaluate(Fixed(), atari_protocol("Boxing"), 4, seed=0)
-    assert lengths == [30] * 4
+    _, lengths = evaluate(Fixed(), atari_protocol("Boxing", n_envs=1), 2, seed=0)
+    assert lengths == [30, 30]
 
 
 class Watching(Fixed):
