@@ -53,7 +53,7 @@ class EqRAlgorithm(SafeFiles):
     _create_aliases: Callable[[], None]  # of the stock algorithm: its own names of the networks
     frame_stack = 1
 
-    @validation.answers_misspelt
+    @validation.answers_misspelt(policy_kwargs=EqRPolicy, replay_buffer_kwargs=PrioritizedSequenceReplayBuffer)
     def __init__(
         self,
         policy: str | type[EqRPolicy],
@@ -145,8 +145,7 @@ class EqRAlgorithm(SafeFiles):
         :raises TypeError: for an argument that there is not, with the nearest one that there is
         :raises AssertionError: if the action space is not Discrete (as SB3)
         """
-        # SB3 fills in the dictionaries that it is given: the caller's are left as they are.
-        policy_kwargs = dict(policy_kwargs or {})
+        policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
         policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
         if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
             # Epsilon of Table 5; one kernel for all parameters, on CPU and GPU, where PyTorch's default has six for each.
@@ -310,6 +309,7 @@ class EqRAlgorithm(SafeFiles):
         self._n_calls += 1
         if self.target_update_interval and self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
             self.policy.update_target(self.tau)
+            self.policy.target_is_copy = False  # it is, until the next gradient step: not worth another CUDA graph
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
@@ -399,8 +399,8 @@ class EqRAlgorithm(SafeFiles):
         progress_bar: bool = False,
     ) -> SelfEqRAlgorithm:
         """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
-        tb_log_name = tb_log_name or type(self).__name__
-        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        log_name = tb_log_name or type(self).__name__
+        super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
         self._log_last_round()
         return self
 

@@ -1,5 +1,5 @@
-"""The group encoder lives in :mod:`sb3_eqr.common.networks`; this is its old import path."""
+"""The encoders live in :mod:`sb3_eqr.common.networks.encoders`; this is their old import path, which YAML files use."""
 
-from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor, GroupFeaturesExtractor, ImpalaExtractor
 
-__all__ = ["GroupFeaturesExtractor"]
+__all__ = ["ConvExtractor", "GroupFeaturesExtractor", "ImpalaExtractor"]

@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
@@ -100,7 +101,11 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
 
 
 class SafeFiles(OffPolicyAlgorithm):
-    """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with whole files only."""
+    """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with complete files only; copies."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For ``pickle`` and ``copy``: the logger, which holds open files, becomes one without output until ``learn``."""
+        return {**self.__dict__, "_logger": Logger(None, []), "_custom_logger": False}
 
     def save(
         self,

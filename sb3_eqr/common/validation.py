@@ -42,30 +42,38 @@ def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, s
             )
 
 
-def check_names(owner: str, given: Iterable[str], legal: Iterable[str]) -> None:
-    """Refuse an argument of ``owner`` that is not legal, with the nearest one that is, or all of them (TypeError)."""
+def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewhere: type) -> None:
+    """
+    Refuse an argument of ``owner`` that is not legal (TypeError): say which keyword takes it (``elsewhere``: its classes), or
+    which legal one is the nearest, or all of them.
+    """
     legal = list(legal)
     for name in given:
         if name not in legal:
-            near = get_close_matches(name, legal, n=1)
-            public = [one for one in legal if not one.startswith("_")]
-            advice = f"Did you mean {near[0]!r}?" if near else f"It takes {', '.join(public)}."
+            places = [place for place, taker in elsewhere.items() if name in inspect.signature(taker).parameters]
+            near = ["symmetry_coef"] if name == "get_coef" else get_close_matches(name, legal, n=1)
+            advice = f"It takes {', '.join(one for one in legal if not one.startswith('_'))}."
+            advice = f"Pass {places[0]}=dict({name}=...)." if places else f"Did you mean {near[0]!r}?" if near else advice
             raise TypeError(f"{owner} got an unexpected argument {name!r}. {advice}")
 
 
-def answers_misspelt(init: Callable[P, None]) -> Callable[P, None]:
+def answers_misspelt(**elsewhere: type) -> Callable[[Callable[P, None]], Callable[P, None]]:
     """
-    Decorator of a constructor: a misspelt argument is answered in the name of the class that was called, with the nearest
-    legal one. Python would name the class that has defined the constructor.
+    Decorator of a constructor: :func:`check_names` in the name of the class that was called. Python would name the class that
+    has defined the constructor, and nothing else.
     """
-    legal = list(inspect.signature(init).parameters)[1:]
 
-    @wraps(init)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
-        check_names(type(args[0]).__name__, kwargs, legal)
-        init(*args, **kwargs)
+    def decorator(init: Callable[P, None]) -> Callable[P, None]:
+        legal = list(inspect.signature(init).parameters)[1:]
 
-    return checked
+        @wraps(init)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+            check_names(type(args[0]).__name__, kwargs, legal, **elsewhere)
+            init(*args, **kwargs)
+
+        return checked
+
+    return decorator
 
 
 def check_action_space(action_space: spaces.Space) -> None:

@@ -7,6 +7,7 @@ from copy import deepcopy
 import cloudpickle
 import pytest
 import torch as th
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 
 from sb3_eqr import GroupFeaturesExtractor
@@ -26,8 +27,9 @@ def continued(model):
 @pytest.mark.parametrize(
     "copied", [deepcopy, lambda m: pickle.loads(pickle.dumps(m)), lambda m: cloudpickle.loads(cloudpickle.dumps(m))]
 )
-def test_a_model_can_be_copied_while_it_trains(make, copied):
+def test_a_model_can_be_copied_while_it_trains(make, copied, tmp_path):
     model = make(ChainEnv(), policy_kwargs={"projection": "own", "aet_loss": "contrastive"}).learn(46)
+    model.set_logger(configure(str(tmp_path), ["stdout", "tensorboard", "csv"]))  # open files
     copy = copied(model)
     before = [p.clone() for p in copy.policy.parameters()]
     ours = continued(model)
@@ -35,6 +37,8 @@ def test_a_model_can_be_copied_while_it_trains(make, copied):
     theirs = continued(copy)
     assert all(th.equal(a, b) for a, b in zip(ours, theirs, strict=True))
     assert any(not th.equal(a, b) for a, b in zip(before, theirs, strict=True))
+    n_updates = copy._n_updates
+    assert copy.learn(2, reset_num_timesteps=False)._n_updates == n_updates + 4 and copy.logger is not model.logger
 
 
 @pytest.mark.parametrize("policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv)])
@@ -59,6 +63,9 @@ def test_state_dicts_are_floats_and_counters(make, policy, env):
             {"prediction_dpeth": 3},
             r"^EqR(QRDQN|Rainbow) got an unexpected argument 'prediction_dpeth'. Did you mean 'prediction_depth'\?",
         ),
+        ({"get_coef": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'get_coef'. Did you mean 'symmetry_coef'\?"),
+        ({"reward_loss": "mse"}, r"got an unexpected argument 'reward_loss'. Pass policy_kwargs=dict\(reward_loss=...\)"),
+        ({"alpha": 0.6}, r"got an unexpected argument 'alpha'. Pass replay_buffer_kwargs=dict\(alpha=...\)"),
         ({"bogus": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'bogus'. It takes policy, env, learning_rate,.*seed"),
         (
             {"policy_kwargs": {"n_block": 3}},

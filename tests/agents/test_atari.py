@@ -250,7 +250,7 @@ def test_a_batch_begins_with_one_to_thirty_noops(monkeypatch):
         batch.send(np.zeros(4, dtype=int))
         assert batch.receive()[2].all()
         drawn += [*batch.n_noops]
-    # Of 84 draws from 1 ... 30: all are legal, the ends are reached to within 2, the mean is off by less than two standard errors.
+    # Of 84 draws from 1 ... 30: all legal, the ends reached to within 2, the mean within two standard errors.
     assert set(drawn) <= set(range(1, 31)) and min(drawn) <= 3 and max(drawn) >= 28
     assert np.mean(drawn) == pytest.approx(15.5, abs=1.9)
 
