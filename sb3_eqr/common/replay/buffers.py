@@ -87,7 +87,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         self._episode_starts = np.ones(n_envs, dtype=bool)
         available = np.inf if psutil is None else psutil.virtual_memory().available
         if (needed := SequenceReplayBuffer.nbytes.fget(self)) > available:  # type: ignore[attr-defined]
-            warnings.warn(f"The replay buffer needs {needed / 1e9:.2f} GB, more than is free: {available / 1e9:.2f} GB.")
+            warnings.warn(  # SB3's sentence
+                "This system does not have apparently enough memory to store the complete replay buffer "
+                f"{needed / 1e9:.2f}GB > {available / 1e9:.2f}GB"
+            )
 
     def _check_arguments(self, frame_stack: int) -> None:
         check_number("n_steps", self.n_steps, 1, whole=True)
