@@ -121,20 +121,23 @@ def test_one_step_without_rollout_is_sb3s_plain_buffer():
         assert th.equal(getattr(found, field), getattr(expected, field)), field
 
 
+STACKS = [
+    (VECTOR, 1, ""),
+    (IMAGES, 4, "zero"),
+    (IMAGES, 1, "zero"),
+    (IMAGES, 4, "repeat"),
+    (IMAGES, 4, "other"),
+    (IMAGES, 2, "zero"),
+]
+WINDOWS = [(3, 5), (6, 2), (1, 1)]
+RINGS = [(3, 101), (1, 25)]  # environments and steps: overwritten three times, and not full yet
+# Every kind of stack on the first window and ring; two kinds on all of them.
+CASES = [(*stack, *WINDOWS[0], *RINGS[0]) for stack in STACKS[2:]]
+CASES += [(*stack, *window, *ring) for stack in STACKS[:2] for window in WINDOWS for ring in RINGS]
+
+
 @BOTH
-@pytest.mark.parametrize(
-    "space, frame_stack, padding",
-    [
-        (VECTOR, 1, ""),
-        (IMAGES, 1, "zero"),
-        (IMAGES, 4, "zero"),
-        (IMAGES, 4, "repeat"),
-        (IMAGES, 4, "other"),
-        (IMAGES, 2, "zero"),
-    ],
-)
-@pytest.mark.parametrize("n_steps, depth", [(3, 5), (6, 2), (1, 1)])
-@pytest.mark.parametrize("n_envs, n_adds", [(1, 25), (3, 101)])
+@pytest.mark.parametrize("space, frame_stack, padding, n_steps, depth, n_envs, n_adds", CASES)
 def test_every_sample_is_what_was_put_in(buffer_class, space, frame_stack, padding, n_steps, depth, n_envs, n_adds):
     stream = Stream(space, n_envs, padding=padding, mean_length=5, channels=4 // frame_stack)
     buffer = buffer_class(
@@ -290,15 +293,15 @@ def test_vec_normalize_acts_on_every_observation_and_on_one_step_rewards():
 
 def test_memory_per_transition_at_atari_size():
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
-    buffer = PrioritizedSequenceReplayBuffer(2_000, space, ACTIONS, "cpu", n_steps=10, prediction_depth=5, frame_stack=4)
+    buffer = PrioritizedSequenceReplayBuffer(500, space, ACTIONS, "cpu", n_steps=10, prediction_depth=5, frame_stack=4)
     frames = np.random.default_rng(0).integers(0, 256, (50, 84, 84), dtype=np.uint8)
     stack = np.zeros((1, 4, 84, 84), dtype=np.uint8)
-    for t in range(4_500):  # wraps twice; an episode every 40 steps, far shorter than a life in Atari
+    for t in range(1_100):  # wraps twice; an episode every 40 steps, far shorter than a life in Atari
         following = np.concatenate([stack[:, 1:], frames[None, None, t % 50]], axis=1)
         done = t % 40 == 39
         buffer.add(stack, following, np.zeros(1), np.zeros(1), np.array([done]), [{}])
         stack = np.zeros_like(stack) if done else following
-    assert buffer.nbytes / 2_000 <= 8_500
+    assert buffer.nbytes / 500 <= 8_500
     stock = ReplayBuffer(10, space, ACTIONS, "cpu")
     assert (stock.observations.nbytes + stock.next_observations.nbytes) / 10 > 56_000
 

@@ -69,7 +69,7 @@ def test_gradients(name, parameterization):
     def function(p, q):
         return group.compose(group.element(p), group.inverse(group.element(q)))
 
-    assert th.autograd.gradcheck(function, params)
+    assert th.autograd.gradcheck(function, params, fast_mode=group.num_params > 9)  # along random directions
 
 
 def random_params(group, seed):
