@@ -21,17 +21,17 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.logger import configure
+from torch.utils.benchmark import timer
 
+from benchmarks.clock import Table, median, take_turns
+from benchmarks.workload import EQR_AGENTS, Floor, fill, make_agent
 from sb3_eqr import EqRRainbow
-from sb3_eqr.benchmark.speed.clock import now, take_turns
-from sb3_eqr.benchmark.speed.floor import Floor
-from sb3_eqr.benchmark.speed.tables import Table
-from sb3_eqr.benchmark.speed.workload import EQR_AGENTS, STEPS_PER_CALL, close, fill, make_agent, train
 from sb3_eqr.common.save_util import atomic_write
 from sb3_eqr.envs import make_atari100k_env
 
 Job = argparse.Namespace  # the command line's options, and ``sizes``
 GAME, ATARI_100K, WAYS = "Pong", 100_000, {"eager": False, "captured": True}
+STEPS_PER_CALL = 2  # updates per environment step, Table 5
 WARM_UP = 12  # updates after which one has been captured
 TOLERANCE = 1e-5  # of parameters, where eager updates repeat themselves exactly
 START_UP = 150.0  # seconds for processes to start, to learn a little and to capture
@@ -42,10 +42,9 @@ SMOKE = {**FULL, "stored": 60, "updates": 16, "rounds": 2, "calls": 1, "starts":
 SMOKE |= {"agent": {"batch_size": 4, "prediction_depth": 1, "buffer_size": 300}, "learning_starts": 30, "processes": (1, 2)}
 
 
-def table(name: str, title: str, rows: list[dict[str, Any]], *notes: str) -> Table:
-    """A column for each key of the rows."""
-    formats = {key: ".4g" if any(isinstance(row[key], float) for row in rows) else "" for key in rows[0]}
-    return Table(name, title, formats, rows, list(notes))
+def train(model: Any) -> None:
+    """The updates of one environment step."""
+    model.train(STEPS_PER_CALL, model.batch_size)
 
 
 def capture_of(model: Any) -> str:
@@ -76,7 +75,7 @@ def check(job: Job) -> Iterator[Table]:
         ok = apart <= max(TOLERANCE, 2 * apart_again) and (capture == "captured" or job.device == "cpu")
         rows.append({"name": name, "eager_again": apart_again, "captured": apart, "capture": capture, "ok": ok})
     title = f"Parameters after {job.sizes['updates']} updates from one seed: largest difference from the eager ones"
-    yield table("parameters", title, rows, f"tolerance: {TOLERANCE}, or twice the difference between two eager agents")
+    yield Table("parameters", title, rows, [f"tolerance: {TOLERANCE}, or twice the difference between two eager agents"])
 
 
 def steps(job: Job) -> Iterator[Table]:
@@ -87,17 +86,17 @@ def steps(job: Job) -> Iterator[Table]:
         floor = Floor(models["eager"])
         works: dict[str, Callable[[], object]] = {"floor": lambda floor=floor: floor.steps(n_calls * STEPS_PER_CALL)}
         works |= {way: lambda model=model: [train(model) for _ in range(n_calls)] for way, model in models.items()}
-        timed = take_turns(works, job.sizes["rounds"], n_calls * STEPS_PER_CALL, job.device)
-        rows = [{"way": way, "ms": series.median, "best_ms": series.best} for way, series in timed.items()]
-        notes = (floor.description(), f"cuda_graph=True: {capture_of(models['captured'])}")
-        yield table(f"updates_{name}", f"{name}: milliseconds per update, 84x84x4", rows, *notes)
+        timed = take_turns(works, job.sizes["rounds"], n_calls * STEPS_PER_CALL)
+        rows = [{"way": way, "ms": median(series.ms), "best_ms": float(series.ms.min())} for way, series in timed.items()]
+        notes = [floor.description(), f"cuda_graph=True: {capture_of(models['captured'])}"]
+        yield Table(f"updates_{name}", f"{name}: milliseconds per update, 84x84x4", rows, notes)
     rows = []
     for way, cuda_graph in WAYS.items():
         model = learning(job, cuda_graph=cuda_graph)
         rate = job.sizes["steps"] / learn(model, job.sizes["steps"])
         rows.append({"way": way, "steps_per_second": rate, "minutes_per_100K": ATARI_100K / rate / 60})
-        close(model)
-    yield table("env_steps", f"Environment steps per second: EqRRainbow on {GAME}, two updates per step", rows)
+        model.env.close()
+    yield Table("env_steps", f"Environment steps per second: EqRRainbow on {GAME}, two updates per step", rows)
 
 
 def make_run(job: Job, **kwargs: Any) -> Any:
@@ -110,9 +109,9 @@ def make_run(job: Job, **kwargs: Any) -> Any:
 
 def learn(model: Any, n_steps: int, deadline: float = float("inf")) -> float:
     """Continue training, for ``n_steps`` or until ``deadline``; returns the seconds that it took."""
-    start = now(str(model.device))
+    start = timer()  # waits for the GPU
     model.learn(n_steps, callback=lambda *_: time.time() < deadline, reset_num_timesteps=False)
-    return now(str(model.device)) - start
+    return timer() - start
 
 
 def learning(job: Job, **kwargs: Any) -> Any:
@@ -137,7 +136,7 @@ def run(job: Job) -> Iterator[Table]:
         model.save(path)
     row = {"steps": model.num_timesteps, "of": total, "updates": model._n_updates, "seconds": model.seconds_so_far}
     row |= {"steps_per_second": model.num_timesteps / model.seconds_so_far, "capture": capture_of(model)}
-    yield table("run", f"{GAME}, {'eager' if job.eager else 'captured'}; saving and loading not counted", [row])
+    yield Table("run", f"{GAME}, {'eager' if job.eager else 'captured'}; saving and loading not counted", [row])
 
 
 def one_of_many(job: Job, seed: int, barrier: Any, rates: Any) -> None:
@@ -161,7 +160,7 @@ def seeds(job: Job) -> Iterator[Table]:
         for process in multiprocessing.active_children():
             process.join()
         rows.append({"processes": n, "slowest_steps_per_second": min(found), "runs_per_hour": sum(found) * 3600 / ATARI_100K})
-        yield table("seeds", "Processes of one agent each on one device", rows)
+        yield Table("seeds", "Processes of one agent each on one device", rows)
 
 
 PARTS: dict[str, Callable[[Job], Iterator[Table]]] = {"check": check, "steps": steps, "run": run, "seeds": seeds}
@@ -188,7 +187,7 @@ def main() -> None:
             print(f"\n{found.text()}", flush=True)
             failed |= not all(row.get("ok", True) for row in found.rows)
             tables = json.loads(job.json.read_text()) if job.json.is_file() else {}
-            tables[found.name] = {**found.data(), "about": {**about, "command": " ".join(sys.argv)}}
+            tables[found.name] = {**found._asdict(), "about": {**about, "command": " ".join(sys.argv)}}
             with atomic_write(job.json, "json") as file:
                 file.write(json.dumps(tables, indent=2).encode())
     sys.exit(failed)

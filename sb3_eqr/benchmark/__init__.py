@@ -1,6 +1,6 @@
 """
 Measuring EqR, and comparing it: ``sb3-eqr benchmark`` trains, evaluates and reports (docs/benchmark.md), ``load_reference``
-has published scores, ``load_scores`` those of a benchmark, ``python -m sb3_eqr.benchmark.speed`` prints what a step costs.
+has published scores, ``load_scores`` those of a benchmark.
 """
 
 import importlib
@@ -11,7 +11,7 @@ __all__ = ["load_reference", "load_scores"]
 _MODULES = {"load_reference": "reference", "load_scores": "scores"}
 
 
-def __getattr__(name: str) -> Any:  # later: speed needs neither pandas nor RL Zoo
+def __getattr__(name: str) -> Any:  # later: load_reference needs no RL Zoo
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sb3_eqr.benchmark.speed.workload import EQR_AGENTS
+from benchmarks.workload import EQR_AGENTS
 from tests.tools.test_package import ROOT
 
 NO_GPU = "a CUDA graph needs a GPU, and the device is 'cpu'"

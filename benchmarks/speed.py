@@ -1,0 +1,241 @@
+"""
+What an update and a step of the environment cost: ``python -m benchmarks.speed`` (docs/results/speed.md).
+
+What is compared takes turns in one process: milliseconds are medians over the rounds, ratios medians of those within a round.
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from itertools import cycle, product
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from torch.profiler import ProfilerActivity, profile, record_function
+from torch.utils.benchmark import Timer, timer
+
+from benchmarks import workload
+from benchmarks.clock import Table, count_operations, median, take_turns
+from benchmarks.sizes import STORED, measure_sizes
+from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, bytes_per_transition, make_agent, make_trainable
+from sb3_eqr.common.save_util import atomic_write
+
+FLOOR, ONES = "floor", ", rounds of one"
+N_COUNTED, N_BEFORE = 10, 50  # updates that are counted, and before: they begin with the backup that is made every 50 updates
+N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
+FEW = 3  # rounds, at most, of what takes long
+GAME, N_GAMES, ONE_BY_ONE, MAX_STEPS = "Pong", 100, 5, 1_000
+BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # until this process has ended, at the latest
+
+
+def in_rounds_of_one(model: Any, n_updates: int) -> None:
+    """As many updates as ``model.train(n_updates)``."""
+    for _ in range(n_updates):
+        model.train(1, model.batch_size)
+
+
+def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
+    """An update of each agent on each network beside QRDQN's and the floor, in long rounds and in rounds of one."""
+    for key in args.network or NETWORKS:
+        n_updates, models = NETWORKS[key].n_updates, {name: make_trainable(name, key, N_BEFORE) for name in AGENTS}
+        counted = {name: count_operations(partial(one.train, N_COUNTED, one.batch_size)) for name, one in models.items()}
+        floor = Floor(models["EqRQRDQN"]) if key == "atari" else None
+        calls: dict[str, Callable[[], object]] = {FLOOR: partial(floor.steps, n_updates)} if floor else {}
+        for name, model in models.items():
+            calls[name] = partial(model.train, n_updates, model.batch_size)
+            calls[name + ONES] = partial(in_rounds_of_one, model, n_updates)
+        found = take_turns(calls, args.rounds, n_updates)
+
+        def ratio(name: str, other: str, found: dict[str, Any] = found) -> float | None:
+            return found[name].ratio(found[other]) if name in found and other in found else None
+
+        rows: list[dict[str, Any]] = []
+        for name in [FLOOR, *models] if floor else models:
+            row = {"name": name, "ms": median(found[name].ms), "cpu_ms": median(found[name].cpu_ms)}
+            row |= {"times_QRDQN": ratio(name, "QRDQN"), "times_floor": ratio(name, FLOOR)}
+            row |= {"times_before": ratio(name, name + BEFORE), "round_of_one": ratio(name + ONES, name)}
+            row |= {"operations": counted[name] / N_COUNTED if name in models else None}
+            row |= {"page_faults": median(found[name].faults)}
+            row |= {"bytes_per_transition": bytes_per_transition(models[name]) if floor and name in models else None}
+            rows.append(row)
+        notes = [floor.description()] if floor else []
+        yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
+
+
+def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
+    """Updates on Atari frames with one and with two threads, beside a busy process."""
+    models = {name: make_trainable(name) for name in ("DQN", "QRDQN", *EQR_AGENTS)}
+
+    def update(model: Any, n_threads: int) -> None:
+        th.set_num_threads(n_threads)
+        model.train(1, model.batch_size)
+
+    calls = {f"{name} {n}": partial(update, model, n) for name, model in models.items() for n in (1, 2)}
+    process = subprocess.Popen([sys.executable, "-c", BUSY])
+    try:
+        found = take_turns(calls, min(args.rounds, FEW))
+    finally:
+        process.kill()
+        process.wait()
+        th.set_num_threads(args.threads)
+    rows = []
+    for name in models:
+        one, two = found[f"{name} 1"].ms, found[f"{name} 2"].ms
+        rows.append({"name": name, "ms_1_thread": median(one), "ms_2_threads": median(two), "slowdown": median(two / one)})
+    yield Table("neighbour", "Update, atari, beside a busy process", rows)
+
+
+def acting_and_storing(name: str, network: str) -> tuple[Callable[[], object], Callable[[], object]]:
+    """What an agent does in a step of the environment: it chooses an action by its network, and stores a transition."""
+    model = make_trainable(name, network)
+    env, transitions = model.env, []
+    obs = env.reset()
+    for _ in range(N_ACTED):
+        actions = np.array([env.action_space.sample()])
+        before, (obs, *rest) = obs, env.step(actions)
+        transitions.append((before, (actions, obs, *rest)))
+    stream = cycle(transitions)
+
+    def store() -> None:
+        model._last_obs, transition = next(stream)
+        model._store_transition(model.replay_buffer, *transition)
+
+    return partial(model._sample_action, 0), store
+
+
+def measure_steps(args: argparse.Namespace) -> Iterator[Table]:
+    """A step of the environment without the environment and without updates: acting and storing."""
+    clock = time.process_time if args.threads == 1 else timer
+    for key in args.network or NETWORKS:
+        calls = {name: acting_and_storing(name, key) for name in AGENTS}
+        options: dict[str, Any] = {"timer": clock, "num_threads": args.threads}
+        timers = [Timer("call()", globals={"call": call}, **options) for both in calls.values() for call in both]
+        rounds = [[one.timeit(N_ACTED).median * 1e3 for one in timers] for _ in range(args.rounds)]
+        acting, storing = np.array(rounds).reshape(args.rounds, -1, 2).T  # (agents, rounds) each
+        whole = acting + storing
+        columns = {"ms_acting": acting, "ms_storing": storing, "ms": whole}
+        columns["times_QRDQN"] = whole / whole[list(calls).index("QRDQN")]
+        rows = [{"name": name} | {key: median(ms[i]) for key, ms in columns.items()} for i, name in enumerate(calls)]
+        yield Table(f"steps_{key}", f"Step of the environment without the environment, {key}", rows)
+
+
+def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
+    """Where the time of an update goes, by PyTorch's profiler, whose own time is part of it: stages and operations."""
+    for key, name in product(args.network or ["minatar"], EQR_AGENTS):
+        model = make_trainable(name, key, N_BEFORE)
+        policy, buffer = model.policy, model.replay_buffer
+        stages = {"sample": buffer, "objective": model, "backward": th.Tensor, "clip_grad_norm_": th.nn.utils}
+        stages |= {"step": policy.optimizer, "update_target": policy, "update_priorities": buffer}
+        with ExitStack() as stack:
+            for stage, owner in stages.items():
+                ranged = record_function(f"stage {stage}")(getattr(owner, stage))
+                stack.enter_context(mock.patch.object(owner, stage, ranged))
+            profiled = stack.enter_context(profile(activities=[ProfilerActivity.CPU]))
+            model.train(N_COUNTED, model.batch_size)
+        rows: list[dict[str, Any]] = []
+        for event in sorted(profiled.key_averages(), key=lambda event: -event.self_cpu_time_total):
+            times = {"ms": event.cpu_time_total / N_COUNTED / 1e3, "self_ms": event.self_cpu_time_total / N_COUNTED / 1e3}
+            rows.append({"name": event.key, "calls": event.count / N_COUNTED, **times})
+        shown = [row for row in rows if row["name"].startswith("stage")]
+        shown += [row for row in rows if row not in shown][:N_OPERATIONS]
+        notes = [f"all: {sum(row['self_ms'] for row in rows):.2f} ms; self: without what is called inside"]
+        yield Table(f"profile_{name}_{key}", f"Update of {name} by stage and operation, {key}", shown, notes)
+
+
+def measure_evaluation(args: argparse.Namespace) -> Iterator[Table]:
+    """The benchmark's evaluation beside SB3's on one environment; making the environments is part of it."""
+    from sb3_eqr.benchmark.evaluation import evaluate, play_environments
+    from sb3_eqr.benchmark.suites import load_suite
+    from sb3_eqr.envs import make_atari100k_env
+
+    protocol: dict[str, Any] = load_suite("atari100k").protocol(GAME)
+    protocol["evaluation"] |= {"max_steps": MAX_STEPS}
+    one: dict[str, Any] = {**protocol, "evaluation": {**protocol["evaluation"], "n_envs": 1}}
+    model = make_agent("EqRQRDQN", env=make_atari100k_env(GAME, seed=0))
+    ways = {
+        f"evaluate_policy, 1 environment, {ONE_BY_ONE} games": partial(play_environments, model, one, ONE_BY_ONE, 0),
+        f"benchmark's evaluate, {N_GAMES} games": partial(evaluate, model, protocol, N_GAMES, 0),
+    }
+    rates = np.zeros((min(args.rounds, FEW), len(ways)))  # steps per second
+    for rate in rates:
+        for place, play in enumerate(ways.values()):
+            start = timer()
+            _, lengths = play()
+            rate[place] = sum(lengths) / (timer() - start)
+    columns = {"steps_per_second": rates, "ratio": rates / rates[:, :1]}
+    rows = [{"name": way} | {key: median(found[:, i]) for key, found in columns.items()} for i, way in enumerate(ways)]
+    yield Table("evaluation", f"Evaluation, {GAME}, games of {MAX_STEPS} steps", rows)
+
+
+MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_evaluation, measure_sizes)
+PARTS = {measure.__name__.removeprefix("measure_"): measure for measure in MEASURES}
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The command line's arguments where none are given; an error of argparse for a wrong one."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__.strip().split("\n")[0])
+    several, all_but_sizes = partial(str.split, sep=","), [part for part in PARTS if part != "sizes"]
+    parser.add_argument("--only", metavar="PARTS", type=several, default=all_but_sizes, help=f"of {', '.join(PARTS)}")
+    networks = f"of {', '.join(NETWORKS)}; default: all, for profile minatar"
+    parser.add_argument("--network", metavar="NETWORKS", type=several, help=networks)
+    parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="threads of PyTorch")
+    parser.add_argument("--rounds", type=int, default=20, help="in which what is compared takes turns")
+    parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured in turns with this one")
+    parser.add_argument("--largest", type=int, default=STORED[-1], metavar="N", help="replay buffer of sizes; 7.2 kB each")
+    parser.add_argument("--json", metavar="FILE", help="write everything there, too")
+    args = parser.parse_args(arguments)
+    for option, known in (("only", PARTS), ("network", NETWORKS)):
+        for name in getattr(args, option) or []:
+            if name not in known:
+                parser.error(f"--{option} must be some of {', '.join(known)}, got {name!r}")
+    for option, least in (("threads", 1), ("rounds", 1), ("largest", STORED[0])):
+        if getattr(args, option) < least:
+            parser.error(f"--{option} must be an integer >= {least}, got {getattr(args, option)}")
+    if args.before and not (pathlib.Path(args.before) / "sb3_eqr" / "__init__.py").is_file():
+        parser.error(f"--before must be a folder with sb3_eqr in it, got {args.before!r}")
+    return args
+
+
+def surroundings(args: argparse.Namespace) -> dict[str, Any]:
+    """What the numbers depend on, for JSON."""
+    info = pathlib.Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    cpu = names[0] if names else platform.processor() or platform.machine()
+    versions = {"torch": th.__version__, "SB3": stable_baselines3.__version__, "numpy": np.__version__}
+    about = {"command": f"python -m benchmarks.speed {' '.join(sys.argv[1:])}", "cpu": cpu, "cores": os.cpu_count()}
+    about |= {"threads": args.threads, "rounds": args.rounds, "python": platform.python_version()}
+    return {**about, "versions": versions, "tables": {}}
+
+
+def main() -> None:
+    """Parse the command line, measure, print, write."""
+    args = parse()
+    th.set_num_threads(args.threads)
+    if args.before:
+        workload.add_before(args.before)
+    about = surroundings(args)
+    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+    print(f"{about['cpu']}, {args.threads} thread(s), {args.rounds} rounds, {versions}")
+    for part in args.only:
+        for table in PARTS[part](args):
+            print(f"\n{table.text()}", flush=True)
+            about["tables"][table.name] = table._asdict()
+    if args.json:
+        with atomic_write(args.json, "json") as file:
+            file.write(json.dumps(about, indent=2).encode())
+
+
+if __name__ == "__main__":
+    main()

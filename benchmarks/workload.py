@@ -1,0 +1,207 @@
+"""What is measured: agents on three networks, random frames for their replay buffers, and the floor under an update."""
+
+import importlib
+import pathlib
+import sys
+import warnings
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from sb3_contrib import QRDQN
+from stable_baselines3 import DQN
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.common.features_extractor import ConvExtractor
+
+SIZE, N_STACK, N_ACTIONS = 84, 4, 6  # Atari's frames, Pong's actions
+BATCH_SIZE = 32  # Table 5, and SB3's default
+EPISODE = 250  # steps; an Atari game loses a life about as often
+BUFFER_SIZE, N_STORED = 3_000, 1_100  # transitions
+OFF, BEFORE = ", group and losses off", " (before)"
+EQR_AGENTS = ("EqRQRDQN", "EqRRainbow")
+
+
+class Network(NamedTuple):
+    """An environment, and what agents are made with for it."""
+
+    policy: str
+    make_game: Callable[[], gym.Env]
+    n_stack: int = 1
+    n_updates: int = 20  # in a round of updates that is timed
+    batch_size: int = BATCH_SIZE
+    policy_kwargs: dict[str, Any] = {}
+    qrdqn: dict[str, Any] = {}  # policy_kwargs of the stock agent
+    eqr: dict[str, Any] = {}  # arguments of the EqR agents
+
+
+def random_frames(size: int, n_channels: int, n_actions: int) -> FakeImageEnv:
+    """Random images (size, size, n_channels), no emulator."""
+    game = FakeImageEnv(n_actions, size, size, n_channels=n_channels, discrete=True)
+    game.ep_length = EPISODE
+    return game
+
+
+NETWORKS = {
+    "atari": Network("CnnPolicy", lambda: random_frames(SIZE, 1, N_ACTIONS), N_STACK, n_updates=10),  # all at their defaults
+    "minatar": Network(
+        "CnnPolicy",
+        lambda: random_frames(10, 4, 3),
+        policy_kwargs={"features_extractor_kwargs": {"layers": [[16, 3, 1]]}, "net_arch": [128]},
+        qrdqn={"n_quantiles": 51},
+        eqr={"shift_pixels": 0, "intensity_scale": 0.0},
+    ),
+    "cartpole": Network(
+        "MlpPolicy",
+        lambda: gym.make("CartPole-v1"),
+        batch_size=64,
+        policy_kwargs={"net_arch": [256]},
+        qrdqn={"n_quantiles": 51},
+    ),
+}
+# Name -> class, and the convolutions of its package.
+ALGORITHMS: tuple[type[Any], ...] = (DQN, QRDQN, EqRQRDQN, EqRRainbow)
+AGENTS = {algorithm.__name__: (algorithm, ConvExtractor) for algorithm in ALGORITHMS}
+AGENTS |= {name + OFF: AGENTS[name] for name in EQR_AGENTS}
+
+
+def add_before(folder: str) -> None:
+    """Add the EqR agents of a checkout of another version of the package to ``AGENTS``, as "... (before)"."""
+
+    def forget() -> dict[str, ModuleType]:
+        names = [name for name in sys.modules if name.partition(".")[0] == "sb3_eqr"]
+        return {name: sys.modules.pop(name) for name in names}
+
+    path, current = str(pathlib.Path(folder).resolve()), forget()
+    sys.path.insert(0, path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # its environments replace those that are registered
+            package = importlib.import_module("sb3_eqr")
+            conv_extractor = importlib.import_module("sb3_eqr.common.features_extractor").ConvExtractor
+        found = {name: (getattr(package, name), conv_extractor) for name in EQR_AGENTS}
+    finally:
+        sys.path.remove(path)
+        forget()
+        sys.modules.update(current)
+    AGENTS.update({name + off + BEFORE: agent for off in ("", OFF) for name, agent in found.items()})
+
+
+def make_env(network: str, n_envs: int = 1) -> VecEnv:
+    """The network's environment, its frames stacked where it has several."""
+    game = NETWORKS[network]
+    env = DummyVecEnv([game.make_game] * n_envs)
+    return VecFrameStack(env, game.n_stack) if game.n_stack > 1 else env
+
+
+def make_agent(
+    name: str, network: str = "atari", env: VecEnv | None = None, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
+) -> Any:
+    """
+    An agent of ``AGENTS`` on one of ``NETWORKS`` that logs nothing. Its replay buffer is small and empty. ``env`` replaces the
+    environment of the network; ``policy_kwargs`` and ``kwargs`` add to its arguments.
+    """
+    (algorithm, conv_extractor), settings = AGENTS[name], NETWORKS[network]
+    layers = {**settings.policy_kwargs, **(settings.qrdqn if name == "QRDQN" else {}), **(policy_kwargs or {})}
+    if "features_extractor_kwargs" in layers:
+        layers["features_extractor_class"] = conv_extractor
+    arguments = {"buffer_size": BUFFER_SIZE, "batch_size": settings.batch_size, "seed": 0, "device": "cpu"}
+    arguments |= settings.eqr if name.startswith(EQR_AGENTS) else {}
+    if OFF in name:
+        layers["group"] = None
+        arguments |= {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
+    env = make_env(network) if env is None else env
+    model = algorithm(settings.policy, env, **{**arguments, **kwargs}, policy_kwargs=layers)
+    model.set_logger(configure(None, []))
+    return model
+
+
+def make_trainable(name: str, network: str = "atari", n_updates: int = 3, **kwargs: Any) -> Any:
+    """As :func:`make_agent`, with ``N_STORED`` transitions of random actions, and past its first updates."""
+    model = make_agent(name, network, **kwargs)
+    starts, model.learning_starts = model.learning_starts, N_STORED + 1
+    model.learn(N_STORED)
+    model.learning_starts, model.exploration_rate = starts, 0.0
+    model.train(n_updates, model.batch_size)
+    return model
+
+
+def play(model: Any, n_steps: int) -> None:
+    """Act and store, without updates; ``n_steps`` of the environments together."""
+    model.learning_starts, model.gradient_steps = 0, 0
+    model.learn(n_steps, reset_num_timesteps=False)
+
+
+def fill(buffer: Any, n_adds: int) -> None:
+    """The same random frames into any buffer of stacks, (4, 84, 84), by so many calls of ``add``."""
+    rng, n_envs = np.random.default_rng(0), buffer.n_envs
+    stack = np.zeros((n_envs, N_STACK, SIZE, SIZE), dtype=np.uint8)
+    for step in range(n_adds):
+        frame = rng.integers(0, 256, (n_envs, 1, SIZE, SIZE), dtype=np.uint8)
+        next_stack = np.concatenate([stack[:, 1:], frame], axis=1)
+        done = np.full(n_envs, step % EPISODE == EPISODE - 1)
+        buffer.add(stack, next_stack, rng.integers(0, N_ACTIONS, n_envs), rng.integers(-1, 2, n_envs), done, [{}] * n_envs)
+        stack = next_stack
+
+
+def bytes_per_transition(model: Any) -> float:
+    """All arrays of the replay buffer over its capacity."""
+    buffer, names = model.replay_buffer, ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+    nbytes = buffer.nbytes if hasattr(buffer, "nbytes") else sum(getattr(buffer, name).nbytes for name in names)
+    return nbytes / (buffer.buffer_size * buffer.n_envs)
+
+
+class Floor:
+    """
+    The convolutions of one update of an EqR agent whose target is a copy of its online network: without gradient those of the
+    observation after the transition and of the M observations of the rollout, with gradient those of the observation itself,
+    but for the images. Each runs on inputs of its own, float32, channels last.
+
+    :param model: whose batch size, M and encoder these are
+    """
+
+    def __init__(self, model: Any):
+        encoder = model.policy.online.features_extractor
+        self.n_trained = model.batch_size
+        self.n_forward = model.batch_size * (1 + (model.depth if model.aet_coef > 0 else 0))
+        self._work: list[tuple[nn.Module, th.Tensor, th.Tensor, th.Tensor]] = []  # images: forward, trained; gradient
+
+        def note(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
+            sizes = (self.n_forward, inputs[0]), (self.n_trained, inputs[0]), (self.n_trained, output)
+            forward, trained, gradient = (
+                th.rand(n, *one.shape[1:], device=model.device).to(memory_format=th.channels_last) for n, one in sizes
+            )
+            self._work.append((module, forward, trained.requires_grad_(bool(self._work)), gradient))
+
+        hooks = [module.register_forward_hook(note) for module in encoder.modules() if isinstance(module, nn.Conv2d)]
+        with th.no_grad():
+            encoder(th.zeros(1, *model.observation_space.shape, device=model.device))
+        for hook in hooks:
+            hook.remove()
+        with FlopCounterMode(display=False) as counter:
+            self.steps(1)
+        self.flop = counter.get_total_flops()  # of one update
+
+    def steps(self, n_updates: int) -> None:
+        """The convolutions of so many updates."""
+        for _ in range(n_updates):
+            with th.no_grad():  # by ``forward``, past all hooks
+                for module, images, _, _ in self._work:
+                    module.forward(images)
+            outputs = [module.forward(images) for module, _, images, _ in self._work]
+            for (module, _, images, gradient), output in reversed(list(zip(self._work, outputs, strict=True))):
+                wanted = [*module.parameters(), *([images] if images.requires_grad else [])]
+                th.autograd.grad(output, wanted, gradient)
+
+    def description(self) -> str:
+        """One line."""
+        images = f"{self.n_forward} images forward, {self.n_trained} forward and backward"
+        return f"floor: {len(self._work)} convolutions, channels last, {images}: {self.flop / 1e9:.3f} GFLOP an update"
