@@ -34,7 +34,7 @@ from sb3_eqr.common.save_util import atomic_write
 FLOOR, ONES = "floor", ", rounds of one"
 N_COUNTED, N_BEFORE = 10, 50  # updates that are counted, and before: they begin with the backup that is made every 50 updates
 N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
-FEW = 3  # rounds, at most, of what takes long
+NEIGHBOUR_ROUNDS, EVALUATION_ROUNDS = 8, 3  # at most: they take long
 GAME, N_GAMES, ONE_BY_ONE, MAX_STEPS = "Pong", 100, 5, 1_000
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # until this process has ended, at the latest
 
@@ -84,7 +84,7 @@ def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
     calls = {f"{name} {n}": partial(update, model, n) for name, model in models.items() for n in (1, 2)}
     process = subprocess.Popen([sys.executable, "-c", BUSY])
     try:
-        found = take_turns(calls, min(args.rounds, FEW))
+        found = take_turns(calls, min(args.rounds, NEIGHBOUR_ROUNDS))
     finally:
         process.kill()
         process.wait()
@@ -167,7 +167,7 @@ def measure_evaluation(args: argparse.Namespace) -> Iterator[Table]:
         f"evaluate_policy, 1 environment, {ONE_BY_ONE} games": partial(play_environments, model, one, ONE_BY_ONE, 0),
         f"benchmark's evaluate, {N_GAMES} games": partial(evaluate, model, protocol, N_GAMES, 0),
     }
-    rates = np.zeros((min(args.rounds, FEW), len(ways)))  # steps per second
+    rates = np.zeros((min(args.rounds, EVALUATION_ROUNDS), len(ways)))  # steps per second
     for rate in rates:
         for place, play in enumerate(ways.values()):
             start = timer()
