@@ -135,7 +135,7 @@ def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
     for key, name in product(args.network or ["minatar"], EQR_AGENTS):
         model = make_trainable(name, key, N_BEFORE)
         policy, buffer = model.policy, model.replay_buffer
-        stages = {"sample": buffer, "objective": model, "backward": th.Tensor, "clip_grad_norm_": th.nn.utils}
+        stages = {"sample": buffer, "objective": model, "backward": th.Tensor}
         stages |= {"step": policy.optimizer, "update_target": policy, "update_priorities": buffer}
         with ExitStack() as stack:
             for stage, owner in stages.items():

@@ -42,7 +42,7 @@ def measure(model: EqRQRDQN, world: PixelPendulum, seed: int) -> dict[str, Any]:
     x = encode(model, images(world, angles, velocities))  # (N, D)
     mirrored = encode(model, images(world, -angles, -velocities))
     latent_model, group = model.policy.latent_model.eval(), model.policy.latent_model.group
-    clockwise, other = th.eye(latent_model.n_actions)[[0, -1]][:, None].expand(-1, N_STATES, -1)  # opposite torques
+    clockwise, other = (th.full((N_STATES,), action) for action in (0, latent_model.n_actions - 1))  # opposite torques
     with th.no_grad():
         symmetry = group.compose(latent_model.blocks(mirrored), group.inverse(latent_model.blocks(x)))  # τ_g
         rho = latent_model.element(latent_model.action_symmetry(symmetry.flatten(1)))

@@ -17,7 +17,6 @@ import matplotlib
 import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
-from torch.nn.functional import one_hot
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.save_util import atomic_write
@@ -111,8 +110,7 @@ def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n
     latent_model = model.policy.latent_model
     with th.no_grad():
         states = encode(model, images(world, starts))
-        steps = one_hot(th.as_tensor(actions), latent_model.n_actions).float()
-        predicted = latent_model.rollout(states, steps, th.ones(actions.shape))[:, -1]  # (n, D)
+        predicted = latent_model.rollout(states, th.as_tensor(actions))[:, -1]  # (n, D)
     nearest = th.cdist(predicted, encode(model, images(world, places))).argmin(dim=1).numpy()
     apart = (places[nearest] - starts - moved / world.n_steps + 0.5) % 1 - 0.5
     return np.linalg.norm(apart, axis=1) / WIDTH

@@ -11,6 +11,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_eqr.common.gradients import assign_gradients
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
@@ -83,7 +84,7 @@ class CapturedGradients:
 
     def _eager(self, samples: SequenceReplayBufferSamples, coefs: Hashable) -> Any:
         terms = self._objective(samples, coefs)
-        terms.loss.backward()
+        assign_gradients(terms.loss, self._parameters)
         return terms
 
     def _beside(self, coefs: Hashable) -> Any:

@@ -15,10 +15,10 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
-from torch import nn
 
 from sb3_eqr.common import validation
 from sb3_eqr.common.cuda_graph import CapturedGradients
+from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy, find_optimizer
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
@@ -309,7 +309,6 @@ class EqRAlgorithm(SafeFiles):
         self._n_calls += 1
         if self.target_update_interval and self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
             self.policy.update_target(self.tau)
-            self.policy.target_is_copy = False  # it is, until the next gradient step: not worth another CUDA graph
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
@@ -337,14 +336,12 @@ class EqRAlgorithm(SafeFiles):
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
             coefs = LossCoefs(self.td_coef, self.aet_coef, self.symmetry_coef, self.reward_coef)
-            optimizer.zero_grad()
             if self._captured is not None:
                 terms = self._captured(samples, coefs)  # the two lines below, as one CUDA graph
             else:
                 terms = self.objective(samples, coefs)
-                terms.loss.backward()
-            max_norm = th.inf if self.max_grad_norm is None else self.max_grad_norm
-            grad_norm = nn.utils.clip_grad_norm_(self._trained, max_norm)
+                assign_gradients(terms.loss, self._trained)
+            grad_norm = clip_grad_norm(self._trained, self.max_grad_norm)
             optimizer.step()
             self._n_updates += 1
             policy.target_is_copy = False
@@ -386,7 +383,6 @@ class EqRAlgorithm(SafeFiles):
         except BadUpdateError as error:
             self._n_updates = error.n_updates
             self._resets.roll_back(error.n_updates)
-            self.policy.target_is_copy = False
             raise
 
     def learn(

@@ -1,12 +1,15 @@
 """What one update minimises (Eq. 21): samples in, loss terms out. How they are applied is ``EqRAlgorithm.train``."""
 
-from math import ceil
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from math import ceil, inf
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.policies import EqRPolicy
@@ -35,13 +38,21 @@ class LossTerms(NamedTuple):
 
     def metrics(self) -> dict[str, th.Tensor]:
         """What is logged: scalars without gradient."""
-        terms = zip(self._fields[:4], self[:4], strict=True)
+        terms = {f"{name}_loss": term for name, term in zip(self._fields[:4], self[:4], strict=True) if term is not None}
+        if self.q_values is not None:
+            terms["mean_q_value"] = self.q_values
         with th.no_grad():
-            found = {f"{name}_loss": term.mean() for name, term in terms if term is not None}
-            found["loss"] = self.loss.detach()
-            if self.q_values is not None:
-                found["mean_q_value"] = self.q_values.mean()
-        return found
+            means = th.stack(list(terms.values())).mean(dim=1)
+        return {**dict(zip(terms, means.unbind(), strict=True)), "loss": self.loss.detach()}
+
+
+class Following(NamedTuple):
+    """What the objective needs of observations that carry no gradient."""
+
+    next_state: th.Tensor  # (B, D): by the target encoder, after the n-step transition; empty without TD loss
+    chooser_state: th.Tensor  # (B, D): the same by the encoder of the network that chooses the next action
+    start: th.Tensor  # (B, D): x̄₀
+    rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, of the AET loss
 
 
 class Objective:
@@ -64,71 +75,78 @@ class Objective:
         observations = self.augment(samples.observations)
         # x₀, (B, D): TD and auxiliary losses meet here and nowhere else, so this is where their gradients can be weighed.
         state = self.policy.online.features_extractor(observations)
+        following = self._encode_following(samples, observations, state, coefs)
         td = priorities = q_values = None
         if coefs.td > 0:
-            td, priorities, q_values = self._td_terms(samples, state)
-        latent = self._latent_losses(samples, state, observations, coefs)
-        weighted = [coef * term for coef, term in zip(coefs, (td, *latent), strict=True) if term is not None]
+            td, priorities, q_values = self._td_terms(samples, state, following)
+        latent = self._latent_losses(samples, state, following, coefs)
+        terms = zip(coefs, (td, *latent), strict=True)
+        weighted = [term if coef == 1 else coef * term for coef, term in terms if term is not None]
         loss = (samples.weights * sum(weighted[1:], weighted[0])).mean()
         return LossTerms(td, *latent, loss, priorities, q_values)
 
-    def _td_terms(self, samples: SequenceReplayBufferSamples, state: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    @th.no_grad()
+    def _encode_following(
+        self, samples: SequenceReplayBufferSamples, observations: PyTorchObs, state: th.Tensor, coefs: LossCoefs
+    ) -> Following:
+        """All that is encoded without gradient. The target copy sees s_t in the same augmentation as the online encoder."""
+        policy, shared = self.policy, self.policy.target_encodes_as_online
+        has_td, has_latent = coefs.td > 0, samples.mask is not None
+        batches = [self.augment(samples.next_observations)] if has_td else []
+        chooser = None
+        if has_td and self.double_q and not shared:
+            chooser = policy.online.features_extractor(batches[0])
+        batches += [observations] if has_latent and not shared else []
+        rollout = [flat(samples.rollout_observations)] if has_latent and coefs.aet > 0 else []
+        pieces = map(self.augment, chain.from_iterable(map(in_pieces, rollout)))
+        passes = encode(policy.target.features_extractor, chain(batches, pieces))  # one tensor for each of the batches
+        next_state = next(passes) if has_td else state.new_empty(0)
+        start = next(passes) if has_latent and not shared else state.detach()
+        states = list(passes)
+        rolled = th.cat(states).view(*samples.mask.shape, -1) if states and samples.mask is not None else None
+        return Following(next_state, next_state if chooser is None else chooser, start, rolled)
+
+    def _td_terms(
+        self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
-        online, target = self.policy.online, self.policy.target
+        online, target, n_samples = self.policy.online, self.policy.target, len(state)
+        # One pass of the online head, with one draw of noise, for both of its uses.
+        states = [state, following.chooser_state] if self.double_q else [state]
+        outputs = online.head(th.cat(states), noisy=True)  # (B or 2 B, N, A)
         with th.no_grad():
-            next_observations = self.augment(samples.next_observations)
-            next_state = chooser_state = target.features_extractor(next_observations)  # (B, D)
-            if self.double_q and not self.policy.target_encodes_as_online:
-                chooser_state = online.features_extractor(next_observations)
-            next_outputs = target.head(next_state, noisy=True)  # (B, N, A)
-            chooser = online.head(chooser_state, noisy=True) if self.double_q else next_outputs
+            next_outputs = target.head(following.next_state, noisy=True)  # (B, N, A)
+            chooser = outputs[n_samples:] if self.double_q else next_outputs
             next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
-            following = of_actions(next_outputs, next_actions)  # (B, N)
-            discounts = (1 - samples.dones) * samples.discounts  # (B, 1)
-        current = of_actions(online.head(state, noisy=True), samples.actions.long())  # (B, N)
-        loss, priorities = online.td_loss(current, following, samples.rewards, discounts)
+            next_best = of_actions(next_outputs, next_actions)  # (B, N)
+            discounts = th.addcmul(samples.discounts, samples.discounts, samples.dones, value=-1)  # (B, 1): 0 at the end
+        current = of_actions(outputs[:n_samples], samples.actions)  # (B, N)
+        loss, priorities = online.td_loss(current, next_best, samples.rewards, discounts)
         return loss, priorities, online.expectation(current.detach())
 
     def _latent_losses(
-        self, samples: SequenceReplayBufferSamples, state: th.Tensor, observations: PyTorchObs, coefs: LossCoefs
+        self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following, coefs: LossCoefs
     ) -> LatentLosses:
-        """The auxiliary losses along the rollout; the target copy sees s_t in the same augmentation."""
+        """The auxiliary losses along the rollout."""
         policy = self.policy
         if samples.mask is None:
             return LatentLosses(None, None, None)
-        with th.no_grad():
-            shared = policy.target_encodes_as_online
-            target_states = (state.detach() if shared else policy.target.features_extractor(observations))[
-                :, None
-            ]  # x̄₀, (B, 1, D)
-            if coefs.aet > 0:
-                rollout = self._encode_rollout(samples)  # x̄₁ ... x̄_M, (B, M, D)
-                target_states = th.cat([target_states, rollout], dim=1)  # (B, M + 1, D)
         return policy.latent_model(
             state,
             samples.rollout_actions,
             samples.rollout_rewards if coefs.reward > 0 else None,
             samples.mask,
-            target_states,
+            following.start,
+            following.rollout,
             policy.latent_model_target if coefs.symmetry > 0 else None,
             policy.project if coefs.aet > 0 else None,
             policy.target_project,
         )
 
-    def _encode_rollout(self, samples: SequenceReplayBufferSamples) -> th.Tensor:
-        """x̄₁ ... x̄_M, (B, M, D)."""
-        assert samples.mask is not None and samples.rollout_observations is not None
-        observations: Any = samples.rollout_observations
-        encoder = self.policy.target.features_extractor
-        is_dict = isinstance(observations, dict)
-        flat = {key: obs.flatten(0, 1) for key, obs in (observations if is_dict else {"": observations}).items()}
-        pieces = [encoder(self.augment(piece if is_dict else piece[""])) for piece in in_pieces(flat)]
-        return th.cat(pieces).unflatten(0, samples.mask.shape)
-
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Outputs of a head, (B, N, A), for actions, (B, 1): (B, N)."""
-    return outputs.gather(dim=2, index=actions[..., None].expand(-1, outputs.shape[1], 1)).squeeze(dim=2)
+    return th.take_along_dim(outputs, actions[..., None], dim=2).squeeze(dim=2)
 
 
 class Augmentation:
@@ -158,24 +176,75 @@ class Augmentation:
             if self.intensity_scale > 0:  # in one pass with the division that preprocess_obs makes: no tensor here is larger
                 unit = 1 / 255 if self._normalize_images else 1.0
                 return random_intensity(observations, self.intensity_scale, unit).float()
+            if self._normalize_images:
+                return observations / 255  # as preprocess_obs, in one pass
         return preprocess_obs(observations, self._spaces[key], self._normalize_images)  # type: ignore[return-value]
 
 
 _PIECE = 2 << 20  # numbers in the observations of one pass on a CPU: 8 MiB as floats, 74 stacks of Atari frames
 
 
-def in_pieces(observations: dict[str, th.Tensor]) -> list[dict[str, th.Tensor]]:
+def flat(observations: PyTorchObs | None) -> PyTorchObs:
+    """Observations of a rollout, (B, M, ...), as one batch, (B * M, ...)."""
+    assert observations is not None
+    if isinstance(observations, dict):
+        return {key: obs.flatten(0, 1) for key, obs in observations.items()}
+    return observations.flatten(0, 1)
+
+
+def in_pieces(observations: PyTorchObs) -> Iterator[PyTorchObs]:
     """
-    Observations, (N, ...) each, cut along the first axis into what a pass without gradient takes at a time: on a CPU as much
-    as its caches hold, in blocks of memory that the C library keeps, whatever M; elsewhere everything.
+    Observations, (N, ...), cut into what a pass without gradient takes at a time: on a CPU as much as its caches hold, in
+    blocks of memory that the C library keeps, whatever M; elsewhere everything.
     """
-    tensors = list(observations.values())
-    if tensors[0].device.type != "cpu":
-        return [observations]
-    n_pieces = ceil(sum(tensor.numel() for tensor in tensors) / _PIECE)
-    at_a_time = ceil(len(tensors[0]) / n_pieces)
+    tensors = tensors_of(observations)
+    if size_of(observations) <= _limit(observations):
+        return iter([observations])
+    at_a_time = ceil(len(tensors[0]) / ceil(size_of(observations) / _limit(observations)))
     pieces = zip(*(tensor.split(at_a_time) for tensor in tensors), strict=True)
-    return [dict(zip(observations, piece, strict=True)) for piece in pieces]
+    return (dict(zip(observations, piece, strict=True)) if isinstance(observations, dict) else piece[0] for piece in pieces)
+
+
+def encode(encoder: nn.Module, batches: Iterable[PyTorchObs]) -> Iterator[th.Tensor]:
+    """
+    Features of each batch of preprocessed observations, (N, D). Batches that are small together are one pass.
+
+    :param encoder: a features extractor
+    :param batches: (N, ...) each, N may differ
+    """
+    waiting: list[PyTorchObs] = []
+    for batch in batches:
+        if waiting and sum(map(size_of, waiting)) + size_of(batch) > _limit(batch):
+            yield from _in_one_pass(encoder, waiting)
+            waiting = []
+        waiting.append(batch)
+    if waiting:
+        yield from _in_one_pass(encoder, waiting)
+
+
+def _in_one_pass(encoder: nn.Module, batches: list[PyTorchObs]) -> Sequence[th.Tensor]:
+    if len(batches) == 1:
+        return [encoder(batches[0])]
+    together: Any = batches
+    if isinstance(batches[0], dict):
+        features = encoder({key: th.cat([batch[key] for batch in together]) for key in batches[0]})
+    else:
+        features = encoder(th.cat(together))
+    return features.split([len(tensors_of(batch)[0]) for batch in batches])
+
+
+def tensors_of(observations: PyTorchObs) -> list[th.Tensor]:
+    """Of a dict its values, else the one tensor."""
+    return list(observations.values()) if isinstance(observations, dict) else [observations]
+
+
+def size_of(observations: PyTorchObs) -> int:
+    """Numbers in all tensors."""
+    return sum(tensor.numel() for tensor in tensors_of(observations))
+
+
+def _limit(observations: PyTorchObs) -> float:
+    return _PIECE if tensors_of(observations)[0].device.type == "cpu" else inf
 
 
 def keep_freed_memory() -> None:

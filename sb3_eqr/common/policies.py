@@ -219,7 +219,7 @@ class EqRPolicy(BasePolicy):
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder.modules())
         self.target_is_copy = True
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
-        self.optimizer.add_param_group({"params": parameters})
+        self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
         _decay_matrices_only(self)
 
     @property
@@ -235,8 +235,11 @@ class EqRPolicy(BasePolicy):
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """As PyTorch's, with the same parameters."""
-        self.target_is_copy = False  # nothing is known of them
-        return super().load_state_dict(*args, **kwargs)
+        result = super().load_state_dict(*args, **kwargs)
+        online, target, online_statistics, target_statistics = self._target_tensors
+        pairs = zip([*online, *online_statistics], [*target, *target_statistics], strict=True)
+        self.target_is_copy = all(th.equal(*pair) for pair in pairs)
+        return result
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
         return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)

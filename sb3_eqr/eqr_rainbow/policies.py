@@ -58,7 +58,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
     ) -> tuple[th.Tensor, th.Tensor]:
         """The cross-entropy with the projected target distribution; the priority is their KL divergence."""
         with th.no_grad():
-            values = rewards + discounts * self.support  # (B, N)
+            values = th.addcmul(rewards, discounts, self.support)  # (B, N)
             target = categorical_projection(values, following.softmax(dim=1), self.v_min, self.v_max)
         return categorical_loss(current, target)
 

@@ -11,7 +11,6 @@ import torch as th
 from PIL import Image
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
-from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import NoGroup
@@ -155,8 +154,7 @@ def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, sta
     latent_model = model.policy.latent_model
     since = th.as_tensor(np.lib.stride_tricks.sliding_window_view(actions, depth)[:n].copy(), device=states.device)  # (n, M)
     with th.no_grad(), eval_mode(model):
-        one_hot = F.one_hot(since, latent_model.n_actions).to(states.dtype)
-        predicted = latent_model.rollout(states[:n], one_hot, th.ones_like(one_hot[..., 0]))[:, -1]
+        predicted = latent_model.rollout(states[:n], since)[:, -1]
     old_enough = th.as_tensor(np.arange(depth, len(states)) - starts[depth:] >= depth, device=states.device)
     nothing = th.full_like(states, float("nan"))
     return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])

@@ -145,8 +145,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
         symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
         params = latent_model.action_symmetry(symmetry.flatten(1))
         rho = group.element(params.unflatten(1, (-1, group.num_params)))
-        one_hot = F.one_hot(data.actions[:, 0], latent_model.n_actions).to(data.states.dtype)
-        kappa = latent_model.action_element(data.states, one_hot)
+        kappa = latent_model.action_element(data.states, data.actions[:, 0])
         left = latent_model.projection(latent_model.act(symmetry, data.predicted[:, 0]))
         right, plain = (
             latent_model.projection(latent_model.act(element, data.states[partner]))

@@ -9,10 +9,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
-from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, MatrixLieGroup, NoGroup, ProductGroup, T
+from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -169,8 +168,7 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     following = encode(model, _map(samples.rollout_observations, lambda obs: obs.flatten(0, 1)))
     latent_model = model.policy.latent_model
     with th.no_grad(), eval_mode(model):
-        one_hot = F.one_hot(actions, latent_model.n_actions).to(states.dtype)
-        predicted = latent_model.rollout(states, one_hot, mask)
+        predicted = latent_model.rollout(states, actions)
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
@@ -194,9 +192,9 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     """
     latent_model = model.policy.latent_model
     n, n_actions = len(states), latent_model.n_actions
-    one_hot = th.eye(n_actions, dtype=states.dtype, device=states.device).repeat(n, 1)  # (N * A, A)
+    actions = th.arange(n_actions, device=states.device).repeat(n)  # (N * A,)
     with th.no_grad(), eval_mode(model):
-        elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), one_hot)
+        elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), actions)
     return elements.flatten(1).unflatten(0, (n, n_actions))
 
 
@@ -228,8 +226,8 @@ def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tenso
     """
     if not isinstance(group, MatrixGroup):  # T, none, and a group of one's own
         return None, elements.reshape(*elements.shape[: elements.dim() - len(group.element_shape)], -1)
-    if isinstance(group, SE) or _is_affine(group):
-        return elements[..., :-1, :-1], elements[..., :-1, -1]
+    if group.is_affine:
+        return elements[..., :-1], elements[..., -1]
     return elements, None
 
 
@@ -289,11 +287,6 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
 def _is_own(group: Group) -> bool:
     """Whether it is a group of the user's own whose elements are no matrices."""
     return not isinstance(group, (MatrixGroup, T, NoGroup))
-
-
-def _is_affine(group: Group) -> bool:
-    """Whether every element's last row is 0 ... 0 1."""
-    return isinstance(group, MatrixLieGroup) and group.element_shape[0] > 1 and not group.generators[:, -1].any()
 
 
 def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:

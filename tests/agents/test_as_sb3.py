@@ -109,7 +109,7 @@ def test_our_extractors_take_features_dim(make, name):
 
 def test_the_group_encoder_hands_features_dim_to_its_trunk():
     encoder = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, n_blocks=2, features_dim=24)
-    assert encoder.to_algebra.in_features == 24 and encoder.features_dim == 18
+    assert encoder.to_algebra.in_features == 24 and encoder.features_dim == 12
     nature = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, trunk_class=NatureCNN, features_dim=24)
     assert nature.trunk.features_dim == 24
 

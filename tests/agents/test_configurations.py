@@ -128,7 +128,7 @@ def test_eqr_bbf_is_the_recipe():
     trunk = model.policy.online.features_extractor.trunk
     assert isinstance(trunk.trunk, ImpalaTrunk) and trunk.rescale and trunk.features_dim == 11 * 11 * 32 * 4
     head = model.policy.online.head
-    assert head.value is not None and head.advantage[0].out_features == 2048 and head.n_atoms == 51
+    assert head.value is not None and head.first[0].out_features == 2 * 2048 and head.n_atoms == 51
     assert (model.policy.v_min, model.policy.v_max) == (-10, 10)
     # 1 where the random steps end, 0 after 2,001 more
     rates = [model.exploration_schedule(1 - step / 100_000) for step in (2_000, 3_000, 4_001, 50_000)]

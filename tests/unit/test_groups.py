@@ -157,8 +157,26 @@ def test_euler_is_the_product_over_planes_worked_out_by_hand():
 def test_se2_element_and_inverse_by_hand():
     group = make_group("SE(2)")
     element = group.element(th.tensor([np.pi / 2, 3.0, 4.0], dtype=th.float64))  # angle first
-    th.testing.assert_close(element, th.tensor([[0.0, 1, 3], [-1, 0, 4], [0, 0, 1]], dtype=th.float64))
-    th.testing.assert_close(group.inverse(element), th.tensor([[0.0, -1, 4], [1, 0, -3], [0, 0, 1]], dtype=th.float64))
+    th.testing.assert_close(element, th.tensor([[0.0, 1, 3], [-1, 0, 4]], dtype=th.float64))
+    th.testing.assert_close(group.inverse(element), th.tensor([[0.0, -1, 4], [1, 0, -3]], dtype=th.float64))
+    whole = th.tensor([[0.0, 1, 3], [-1, 0, 4], [0, 0, 1]], dtype=th.float64)
+    th.testing.assert_close(group.matrix(element), whole)
+
+
+@pytest.mark.parametrize("name", ["SE(2)", "SE(3)", "GL(2)", "SO(3)", "affine"])
+def test_operations_are_those_of_the_matrices(name):
+    """What an element leaves out of its matrix is constant: the matrix product and inverse give the same."""
+    affine = [[[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 1, 0], [0, 0, 0]]]
+    group = MatrixLieGroup(affine) if name == "affine" else make_group(name)
+    params = th.randn(2, 5, group.num_params, generator=th.Generator().manual_seed(0), dtype=th.float64)
+    left, right = group.element(params)
+    product = group.matrix(left) @ group.matrix(right)
+    th.testing.assert_close(group.matrix(group.compose(left, right)), product, rtol=0, atol=1e-12)
+    th.testing.assert_close(group.matrix(group.inverse(left)), th.linalg.inv(group.matrix(left)), rtol=1e-9, atol=1e-9)
+    if name == "affine":
+        whole = th.matrix_exp(th.einsum("nd,dij->nij", params[0], th.tensor(affine, dtype=th.float64)))
+        assert group.element_shape == (2, 3)
+        th.testing.assert_close(group.matrix(left), whole, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", range(1, 7))
@@ -172,11 +190,11 @@ def test_parameter_counts_of_table_1(n):
 
 def test_element_shapes():
     assert make_group("GL(3)").element_shape == (3, 3)
-    assert make_group("SE(3)").element_shape == (4, 4)
+    assert make_group("SE(3)").element_shape == (3, 4)  # of a 4×4 matrix, the last row of which never moves
     assert make_group("T(3)").element_shape == (3,)
     product = make_group("SE(2)^8 x SO(3)^4")
     assert product.num_params == 8 * 3 + 4 * 3
-    assert product.element_shape == (8 * 9 + 4 * 9,)
+    assert product.element_shape == (8 * 6 + 4 * 9,)
 
 
 def test_product_is_its_factors_side_by_side():
@@ -188,7 +206,8 @@ def test_product_is_its_factors_side_by_side():
         return se2.element(first), so3.element(second)
 
     (a, b), (c, d) = pieces(p), pieces(q)
-    expected = th.cat([(a @ c).flatten(1), (b @ d).flatten(1)], dim=1)
+    moved = (se2.matrix(a) @ se2.matrix(c))[..., :2, :]
+    expected = th.cat([moved.flatten(1), (b @ d).flatten(1)], dim=1)
     found = product.compose(product.element(p), product.element(q))
     th.testing.assert_close(found, expected, rtol=0, atol=1e-14)
 

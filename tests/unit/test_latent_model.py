@@ -13,15 +13,16 @@ def identity(states):
     return states
 
 
-class ActionAngle(nn.Module):
-    """The true κ of a world where action 0 turns by +θ and action 1 by −θ, whatever the state."""
+class KnownActions(LatentModel):
+    """SO(2), one block, with the κ of a world where action 0 turns by +θ and action 1 by −θ, whatever the state."""
 
     def __init__(self, theta):
-        super().__init__()
+        super().__init__(make_group("SO(2)"), 1, 2, state_dependent_actions=False)
         self.theta = theta
+        self.double()
 
-    def forward(self, state_and_action):
-        return self.theta * (state_and_action[:, -2:-1] - state_and_action[:, -1:])
+    def action_params(self, state, actions):
+        return self.theta * (1.0 - 2.0 * actions[:, None].to(state.dtype))
 
 
 class Constant(nn.Module):
@@ -38,55 +39,54 @@ def rotation(angles):
     return th.tensor(np.stack([cos, sin, -sin, cos], axis=-1))  # flattened [[cos, sin], [-sin, cos]]
 
 
-def rotation_world(kappa, rho_angle=0.0, mask=None):
+def rotation_world(theta, rho_angle=0.0, mask=None):
     """Losses on three starts and a few actions; the true world turns by ±0.7 radians."""
-    model = LatentModel(make_group("SO(2)"), 1, 2).double()
-    model.transition, model.action_symmetry, model.projection = kappa, Constant(rho_angle), nn.Identity()
+    model, target = KnownActions(theta), KnownActions(0.7)
+    model.action_symmetry, model.projection, target.projection = Constant(rho_angle), nn.Identity(), nn.Identity()
     model.reward_net = Constant(0.25)
-    target = LatentModel(make_group("SO(2)"), 1, 2).double()
-    target.transition, target.projection = ActionAngle(0.7), nn.Identity()
     starts = np.array([0.0, 1.0, -2.5])
     actions = th.tensor([[0, 0, 1], [1, 1, 1], [0, 1, 0]])
     turns = np.cumsum(np.where(actions == 0, 0.7, -0.7), axis=1)
     angles = np.concatenate([starts[:, None], starts[:, None] + turns], axis=1)
     rewards = th.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.25, 0.25, 0.25]], dtype=th.float64)
     mask = th.ones(3, 3, dtype=th.float64) if mask is None else mask
-    return model(rotation(starts), actions, rewards, mask, rotation(angles), target, identity, identity), turns
+    truth = rotation(angles)
+    return model(rotation(starts), actions, rewards, mask, truth[:, 0], truth[:, 1:], target, identity, identity), turns
 
 
 def test_the_true_kappa_has_no_transition_loss():
-    losses, _ = rotation_world(ActionAngle(0.7))
+    losses, _ = rotation_world(0.7)
     assert losses.aet.abs().max() < 1e-14
     assert losses.symmetry.abs().max() < 1e-14
 
 
 def test_wrong_kappas_cost_what_geometry_says():
     """Two unit-normed rotation matrices that differ by the angle δ lie 2 − 2 cos δ apart."""
-    losses, turns = rotation_world(ActionAngle(0.0))  # never moves
+    losses, turns = rotation_world(0.0)  # never moves
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).sum(axis=1), atol=1e-12)
     np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
-    losses, turns = rotation_world(ActionAngle(-0.7))  # moves the wrong way
+    losses, turns = rotation_world(-0.7)  # moves the wrong way
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).sum(axis=1), atol=1e-12)
 
 
 def test_a_wrong_rho_costs_get_alone():
-    losses, _ = rotation_world(ActionAngle(0.7), rho_angle=0.4)
+    losses, _ = rotation_world(0.7, rho_angle=0.4)
     assert losses.aet.abs().max() < 1e-14
     np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.4)] * 3, atol=1e-12)
 
 
 def test_reward_loss_by_hand():
-    losses, _ = rotation_world(ActionAngle(0.7))  # predicts 0.25 everywhere
+    losses, _ = rotation_world(0.7)  # predicts 0.25 everywhere
     expected = [0.75**2 + 2 * 0.25**2, 2 * 0.25**2 + 1.25**2, 0.0]
     np.testing.assert_allclose(losses.reward, expected, atol=1e-12)
 
 
 def test_every_loss_obeys_the_mask():
     mask = th.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 0.0]], dtype=th.float64)
-    losses, turns = rotation_world(ActionAngle(0.0), mask=mask)
+    losses, turns = rotation_world(0.0, mask=mask)
     np.testing.assert_allclose(losses.aet, ((2 - 2 * np.cos(turns)) * mask.numpy()).sum(axis=1), atol=1e-12)
     np.testing.assert_allclose(losses.reward, [0.75**2, 2 * 0.25**2 + 1.25**2, 0.0], atol=1e-12)
-    losses, _ = rotation_world(ActionAngle(0.0), mask=th.zeros(3, 3, dtype=th.float64))
+    losses, _ = rotation_world(0.0, mask=th.zeros(3, 3, dtype=th.float64))
     assert all((loss == 0).all() for loss in losses)
 
 
@@ -102,10 +102,11 @@ def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", batch=6, depth=4, 
         "actions": th.randint(5, (batch, depth)),
         "rewards": th.randn(batch, depth, dtype=th.float64),
         "mask": th.ones(batch, depth, dtype=th.float64),
-        "target_states": made.element(params).flatten(2),
+        "target_state": made.element(params[:, 0]).flatten(1),
+        "target_rollout": made.element(params[:, 1:]).flatten(2),
         "target": target,
-        "project": nn.Linear(3 * n_blocks * 3, 7).double(),
-        "target_project": nn.Linear(3 * n_blocks * 3, 7).double().requires_grad_(False),
+        "project": nn.Linear(2 * n_blocks * 3, 7).double(),
+        "target_project": nn.Linear(2 * n_blocks * 3, 7).double().requires_grad_(False),
     }
     return model, case
 
@@ -131,7 +132,10 @@ def test_against_loops_over_samples_and_blocks():
         return [se2(p) for p in run(network, *inputs).reshape(3, 3)]
 
     def blocks(flat):
-        return list(flat.reshape(3, 3, 3))
+        return [np.vstack([top, [0, 0, 1]]) for top in flat.reshape(3, 2, 3)]
+
+    def entries(matrices):
+        return np.stack(matrices)[:, :2].ravel()  # the last row never moves
 
     def distance(a, b):
         return np.sum((a / np.linalg.norm(a) - b / np.linalg.norm(b)) ** 2)
@@ -143,20 +147,20 @@ def test_against_loops_over_samples_and_blocks():
         for m in range(4):
             action = np.eye(5)[case["actions"][i, m]]
             moved = [k @ b for k, b in zip(elements(model.transition, x, action), blocks(x), strict=True)]
-            x = np.stack(moved).ravel()
+            x = entries(moved)
             predictions.append(x)
-            truth = case["target_states"][i, m + 1].numpy()
+            truth = case["target_rollout"][i, m].numpy()
             aet += distance(run(case["project"], x), run(case["target_project"], truth))
             reward += (run(model.reward_net, x)[0] - case["rewards"][i, m].item()) ** 2
         assert losses.aet[i].item() == pytest.approx(aet, rel=1e-10)
         assert losses.reward[i].item() == pytest.approx(reward, rel=1e-10)
 
-        start, partner = case["state"][i].numpy(), case["target_states"][partners[i], 0].numpy()
+        start, partner = case["state"][i].numpy(), case["target_state"][partners[i]].numpy()
         symmetry = [p @ np.linalg.inv(s) for p, s in zip(blocks(partner), blocks(start), strict=True)]
-        left = np.stack([g @ b for g, b in zip(symmetry, blocks(predictions[0]), strict=True)]).ravel()
-        rho = elements(model.action_symmetry, np.stack(symmetry).ravel())
+        left = entries([g @ b for g, b in zip(symmetry, blocks(predictions[0]), strict=True)])
+        rho = elements(model.action_symmetry, entries(symmetry))
         kappa = elements(case["target"].transition, start, np.eye(5)[case["actions"][i, 0]])
-        right = np.stack([r @ k @ p for r, k, p in zip(rho, kappa, blocks(partner), strict=True)]).ravel()
+        right = entries([r @ k @ p for r, k, p in zip(rho, kappa, blocks(partner), strict=True)])
         get = distance(run(model.projection, left), run(case["target"].projection, right))
         assert losses.symmetry[i].item() == pytest.approx(get, rel=1e-10)
 
@@ -177,12 +181,12 @@ def test_what_lies_behind_the_mask_has_no_influence(reward_loss):
         sum(loss.sum() for loss in losses).backward()
         return [*losses, case["state"].grad.clone(), *(p.grad.clone() for p in model.parameters())]
 
-    rewards, actions, targets = case["rewards"].clone(), case["actions"].clone(), case["target_states"].clone()
+    rewards, actions, targets = case["rewards"].clone(), case["actions"].clone(), case["target_rollout"].clone()
     hidden = case["mask"] == 0
     rewards[hidden], actions[hidden] = -77.0, 4
-    targets[:, 1:][hidden] = 123.0
+    targets[hidden] = 123.0
     before = run()
-    after = run(rewards=rewards, actions=actions, target_states=targets)
+    after = run(rewards=rewards, actions=actions, target_rollout=targets)
     assert all(th.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
@@ -208,13 +212,12 @@ def test_the_group_action_between_states_carries_no_gradient():
     On SO(2) with a κ that ignores the state, τ_g · κ · x₀ does not depend on the angle a of x₀: were τ_g to carry a
     gradient, d GET / da would be 0. Held fixed, GET = 2 − 2 cos(δ + a − a₀) with δ = −ρ, so d GET / da = −2 sin ρ.
     """
-    model = LatentModel(make_group("SO(2)"), 1, 2).double()
-    model.transition, model.projection = Constant(0.3), nn.Identity()
+    model = KnownActions(0.3)
+    model.projection = nn.Identity()
     model.action_symmetry = Constant(0.9)
     angles = th.tensor([[0.2], [1.5], [-0.8]], dtype=th.float64, requires_grad=True)
     state = model.group.element(angles).flatten(1)
-    targets = rotation(np.zeros((3, 2)))
-    losses = model(state, th.zeros(3, 1).long(), None, th.ones(3, 1), targets, model, None, identity)
+    losses = model(state, th.zeros(3, 1).long(), None, th.ones(3, 1), rotation(np.zeros(3)), None, model, None, identity)
     assert losses.aet is None and losses.reward is None
     losses.symmetry.sum().backward()
     np.testing.assert_allclose(angles.grad, np.full((3, 1), -2 * np.sin(0.9)), atol=1e-12)
@@ -228,9 +231,9 @@ def test_every_group_trains(group):
     size = 2 * int(np.prod(made.element_shape))
     states = made.element(th.randn(8, 4, 2, made.num_params)).flatten(2)
     state = states[:, 0].clone().requires_grad_()
-    losses = model(
-        state, th.randint(3, (8, 3)), th.randn(8, 3), th.ones(8, 3), states, model, nn.Linear(size, 5), nn.Linear(size, 5)
-    )
+    projections = nn.Linear(size, 5), nn.Linear(size, 5)
+    actions, rewards, mask = th.randint(3, (8, 3)), th.randn(8, 3), th.ones(8, 3)
+    losses = model(state, actions, rewards, mask, states[:, 0], states[:, 1:], model, *projections)
     sum(loss.sum() for loss in losses).backward()
     assert all(loss.shape == (8,) and th.isfinite(loss).all() for loss in losses)
     assert th.isfinite(state.grad).all() and all(th.isfinite(p.grad).all() for p in model.parameters())
@@ -240,9 +243,8 @@ def test_a_singular_state_neither_stops_nor_poisons():
     made = make_group("GL(2)")
     model = LatentModel(made, 2, 3)
     state = th.zeros(4, 8, requires_grad=True)
-    losses = model(
-        state, th.zeros(4, 2, dtype=th.int64), th.zeros(4, 2), th.ones(4, 2), th.zeros(4, 3, 8), model, identity, identity
-    )
+    actions, rewards, mask, targets = th.zeros(4, 2, dtype=th.int64), th.zeros(4, 2), th.ones(4, 2), th.zeros(4, 2, 8)
+    losses = model(state, actions, rewards, mask, targets[:, 0], targets, model, identity, identity)
     sum(loss.sum() for loss in losses).backward()
     assert th.isfinite(state.grad).all() and all(th.isfinite(loss).all() for loss in losses)
 
@@ -263,6 +265,5 @@ def test_what_is_absent_is_off():
 
 def test_without_a_group_the_network_predicts_the_next_state():
     free = LatentModel(make_group("none(6)"), 1, 3).eval()
-    one_hot = th.eye(3)
-    expected = free.transition(th.cat([th.ones(3, 6), one_hot], dim=1))
-    assert th.equal(free.rollout(th.ones(3, 6), one_hot[:, None], th.ones(3, 1))[:, 0], expected)
+    expected = free.transition(th.cat([th.ones(3, 6), th.eye(3)], dim=1))
+    th.testing.assert_close(free.rollout(th.ones(3, 6), th.arange(3)[:, None])[:, 0], expected)

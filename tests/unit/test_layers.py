@@ -5,7 +5,7 @@ from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.networks.encoders import ConvTrunk
-from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening
+from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening, draw_noise
 
 
 def test_noise_is_factorised_and_fresh():
@@ -18,10 +18,9 @@ def test_noise_is_factorised_and_fresh():
     zero = th.zeros(1, 6)
     draws = []
     for _ in range(3):
-        state = th.get_rng_state()
-        noisy = layer(eye, noisy=True) - clean
-        th.set_rng_state(state)
-        bias_noise = layer(zero, noisy=True) - layer(zero)  # the same draw: what the bias alone gets
+        (noise,) = draw_noise([layer])
+        noisy = layer(eye, noise) - clean
+        bias_noise = layer(zero, noise) - layer(zero)  # what the bias alone gets
         weight_noise = (noisy - bias_noise).T / layer.weight_sigma  # f(ε_out) f(ε_in)ᵀ
         singular = th.linalg.svdvals(weight_noise)
         assert singular[1] < 1e-5 * singular[0]
@@ -30,11 +29,22 @@ def test_noise_is_factorised_and_fresh():
 
 
 def test_noise_does_not_depend_on_train_mode():
-    layer = NoisyLinear(4, 4).eval()
+    head = DistributionalHead(4, 2, 3, [8], nn.ReLU, dueling=True, sigma_init=0.5).eval()
     inputs = th.randn(2, 4)
-    assert not th.equal(layer(inputs, noisy=True), layer(inputs, noisy=True))
-    layer.train()
-    assert th.equal(layer(inputs), layer(inputs))
+    assert not th.equal(head(inputs, noisy=True), head(inputs, noisy=True))
+    head.train()
+    assert th.equal(head(inputs), head(inputs))
+
+
+def test_a_draw_is_that_of_the_paper_for_every_layer():
+    """f(ε) = sign(ε) √|ε| of numbers drawn once, in the layers' order: outputs of the first, its inputs, and so on."""
+    layers = [NoisyLinear(6, 5), NoisyLinear(5, 2)]
+    th.manual_seed(0)
+    (out_1, in_1), (out_2, in_2) = draw_noise(layers)
+    th.manual_seed(0)
+    epsilon = th.randn(18)
+    assert th.equal(th.cat([out_1, in_1, out_2, in_2]), epsilon.sign() * epsilon.abs().sqrt())
+    assert [len(noise) for noise in (out_1, in_1, out_2, in_2)] == [5, 6, 2, 5]
 
 
 def test_noisy_initialisation_is_that_of_the_paper():
@@ -44,11 +54,17 @@ def test_noisy_initialisation_is_that_of_the_paper():
     assert (layer.weight_sigma == 0.125).all() and (layer.bias_sigma == 0.125).all()
 
 
-def test_dueling_by_hand():
-    head = DistributionalHead(2, 3, 4, [8], nn.ReLU, dueling=True, sigma_init=None)
+@pytest.mark.parametrize("net_arch", [[], [8], [8, 6]], ids=str)
+def test_dueling_by_hand(net_arch):
+    """Two networks of their own, whose first layers lie side by side in one: first the advantage's, then the value's."""
+    head = DistributionalHead(2, 3, 4, net_arch, nn.ReLU, dueling=True, sigma_init=None)
     features = th.randn(5, 2)
-    value = head.value(features)  # (5, 4)
-    advantage = head.advantage(features).view(5, 4, 3)
+    hidden = [features, features]
+    if net_arch:
+        weight, bias = head.first[0].weight, head.first[0].bias
+        hidden = [nn.functional.linear(features, weight[part], bias[part]).relu() for part in (slice(8), slice(8, 16))]
+    advantage = head.advantage(hidden[0]).view(5, 4, 3)
+    value = head.value(hidden[1])  # (5, 4)
     found = head(features)
     for action in range(3):
         expected = value + advantage[:, :, action] - (advantage[:, :, 0] + advantage[:, :, 1] + advantage[:, :, 2]) / 3
@@ -57,10 +73,9 @@ def test_dueling_by_hand():
 
 def test_projection_is_the_first_layer_without_noise():
     head = DistributionalHead(2, 3, 4, [8], nn.ReLU, dueling=True, sigma_init=0.5)
-    features = th.randn(5, 6, 2)
-    expected = th.cat([nn.functional.linear(features, s[0].weight, s[0].bias) for s in (head.value, head.advantage)], -1)
-    assert th.equal(head.project(features), expected)
-    assert head.project(features).shape == (5, 6, 16)
+    features = th.randn(5, 2)
+    assert th.equal(head.project(features), nn.functional.linear(features, head.first[0].weight, head.first[0].bias))
+    assert head.project(features).shape == (5, 16)
 
 
 def test_conv_trunk_is_the_network_of_2015():

@@ -1,8 +1,11 @@
 """What every group offers to encoder and latent model (EqR, §3.1 and §4)."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch as th
+
+Gradients = Callable[[th.Tensor], tuple[th.Tensor, ...]]
 
 
 class Group(ABC):
@@ -42,6 +45,19 @@ class Group(ABC):
         :param right: (..., \\*element_shape), broadcast against ``left``
         :return: (..., \\*element_shape)
         """
+
+    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
+        """
+        ``compose(element(params), right)``, and its vector-Jacobian product: from the gradient of the result to those of
+        ``params`` and ``right``. Here by autograd; a group may know both in closed form. For use under ``no_grad``.
+
+        :param params: (..., num_params)
+        :param right: (..., \\*element_shape), with the same leading dimensions
+        """
+        with th.enable_grad():
+            inputs = params.detach().requires_grad_(), right.detach().requires_grad_()
+            moved = self.compose(self.element(inputs[0]), inputs[1])
+        return moved.detach(), lambda gradient: th.autograd.grad(moved, inputs, gradient, materialize_grads=True)
 
     @abstractmethod
     def inverse(self, element: th.Tensor) -> th.Tensor:

@@ -3,11 +3,13 @@
 import zlib
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import torch as th
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from sb3_eqr.common.groups.base import Group
+from sb3_eqr.common.groups.base import Gradients, Group
 
 
 def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
@@ -18,15 +20,57 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :param angles: radians, (..., n(n-1)/2)
     :return: (..., n, n)
     """
-    cos, sin = angles.cos(), angles.sin()  # (..., planes)
     if n == 2:  # one plane: there is nothing to multiply
-        return th.cat([cos, sin, -sin, cos], dim=-1).unflatten(-1, (2, 2))
-    cos, sin = cos[..., None], sin[..., None]
+        return _PlaneRotation.apply(angles)
+    cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # (..., planes, 1)
     columns = list(th.eye(n, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], n, n).unbind(-1))
     for plane, (i, j) in enumerate(_planes(n)):  # multiplying by R^{ij} from the right mixes columns i and j
         c, s = cos[..., plane, :], sin[..., plane, :]
         columns[i], columns[j] = c * columns[i] - s * columns[j], s * columns[i] + c * columns[j]
     return th.stack(columns, dim=-1)
+
+
+def _plane_rotation(angles: th.Tensor) -> th.Tensor:
+    """R(θ) of angles, (..., 1): (..., 2, 2)."""
+    cos, sin = angles.cos(), angles.sin()
+    return th.cat([cos, sin, -sin, cos], dim=-1).view(*angles.shape[:-1], 2, 2)
+
+
+def _rotate_plane(angles: th.Tensor, columns: th.Tensor) -> tuple[th.Tensor, Gradients]:
+    """
+    R(θ) S of angles, (..., 1), and columns S, (..., 2, n), with the same leading dimensions: (..., 2, n), and its
+    vector-Jacobian product. The derivative of R(θ) = exp(θE) is E R(θ): a third of the operations that its entries take.
+    """
+    rotation = _plane_rotation(angles)
+    rotated = rotation @ columns
+    return rotated, lambda gradient: (_gradient_of_angles(gradient, rotated), rotation.mT @ gradient)
+
+
+def _gradient_of_angles(gradient: th.Tensor, rotated: th.Tensor) -> th.Tensor:
+    """From that of R(θ) S, and R(θ) S, (..., 2, n) each, to that of θ, (..., 1)."""
+    plane = _skew_basis(2, rotated.dtype, rotated.device)  # E, (1, 2, 2)
+    return (gradient * (plane @ rotated)).sum(dim=(-2, -1))[..., None]
+
+
+class _PlaneRotation(th.autograd.Function):
+    """:func:`_plane_rotation` with the gradient of :func:`_rotate_plane`."""
+
+    @staticmethod
+    def forward(ctx: Any, angles: th.Tensor) -> th.Tensor:
+        rotation = _plane_rotation(angles)
+        ctx.save_for_backward(rotation)
+        return rotation
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
+        return _gradient_of_angles(gradient, *ctx.saved_tensors)
+
+
+@cache
+def _eye(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
+    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+        return th.eye(n, dtype=dtype).to(device)
 
 
 def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
@@ -99,16 +143,34 @@ ROTATIONS: dict[str, tuple[Callable[[int], int], Callable[[th.Tensor, int], th.T
 
 
 class MatrixGroup(Group):
-    """Matrices under multiplication; the base of GL, SE, SO and of groups given by generators."""
+    """
+    Matrices under multiplication; the base of GL, SE, SO and of groups given by generators.
+
+    :param name: of the group
+    :param num_params: numbers per element
+    :param size: m of the m×m matrices
+    :param is_affine: whether every matrix has the last row 0 ... 0 1. An element leaves it out: it never moves
+    """
+
+    def __init__(self, name: str, num_params: int, size: int, is_affine: bool = False):
+        super().__init__(name, num_params, (size - 1 if is_affine else size, size))
+        self.is_affine = is_affine
+
+    def matrix(self, element: th.Tensor) -> th.Tensor:
+        """The matrices of elements, (..., *element_shape): (..., m, m)."""
+        if not self.is_affine:
+            return element
+        m = element.shape[-1]
+        return th.cat([element, _eye(m, element.dtype, element.device)[-1:].expand(*element.shape[:-2], 1, m)], dim=-2)
 
     def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
-        return left @ right
+        return left @ self.matrix(right)  # [A, t] [[A', t'], [0, 1]] = [A A', A t' + t]
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
-        return guarded_inverse(element)
+        return guarded_inverse(self.matrix(element))[..., : self.element_shape[0], :]
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
-        return th.eye(self.element_shape[-1], dtype=dtype, device=device).expand(*batch, *self.element_shape)
+        return th.eye(*self.element_shape, dtype=dtype, device=device).expand(*batch, *self.element_shape)
 
 
 # An inverse is replaced by its damped form where the condition number exceeds the inverse of this many
@@ -145,7 +207,7 @@ class GL(MatrixGroup):
     """General linear: n×n matrices, each entry predicted (almost every one is invertible, appendix A.2)."""
 
     def __init__(self, n: int):
-        super().__init__(f"GL({n})", n * n, (n, n))
+        super().__init__(f"GL({n})", n * n, n)
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return params.unflatten(-1, self.element_shape)
@@ -154,55 +216,80 @@ class GL(MatrixGroup):
         return th.eye(self.element_shape[0]).flatten()
 
 
-class SO(MatrixGroup):
+class _Rotations(MatrixGroup):
+    """
+    What SO and SE share.
+
+    :param name: "SO" or "SE"
+    :param n: of n-space
+    :param parameterization: in ``ROTATIONS``
+    :param n_shifts: translations, 0 or n
+    """
+
+    def __init__(self, name: str, n: int, parameterization: str, n_shifts: int):
+        self.n_angles, self.rotation = ROTATIONS[parameterization][0](n), ROTATIONS[parameterization][1]
+        super().__init__(f"{name}({n})", self.n_angles + n_shifts, n + (n_shifts > 0), is_affine=n_shifts > 0)
+        self.n = n
+        self.parameterization = parameterization
+
+    @property
+    def _turns_plane(self) -> bool:
+        """Whether R(θ) has a closed form of its own."""
+        return self.n == 2 and self.parameterization != "gram-schmidt"
+
+
+class SO(_Rotations):
     """Special orthogonal: rotations of n-space, n ≥ 2."""
 
     def __init__(self, n: int, parameterization: str = "euler"):
-        count, self.rotation = ROTATIONS[parameterization]
-        super().__init__(f"SO({n})", count(n), (n, n))
-        self.parameterization = parameterization
+        super().__init__("SO", n, parameterization, n_shifts=0)
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        return self.rotation(params, self.element_shape[-1])
+        return self.rotation(params, self.n)
+
+    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
+        return _rotate_plane(params, right) if self._turns_plane else super().act_vjp(params, right)
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
         return element.mT
 
     @property
     def for_actions(self) -> Group:
-        return SO(self.element_shape[-1]) if self.parameterization == "gram-schmidt" else self
+        return SO(self.n) if self.parameterization == "gram-schmidt" else self
 
 
-class SE(MatrixGroup):
-    """Special Euclidean: [[R, t], [0, 1]]. What makes R comes first among the parameters, then t."""
+class SE(_Rotations):
+    """
+    Special Euclidean: [[R, t], [0, 1]], of which an element holds the entries that move, [R, t]. What makes R comes first
+    among the parameters, then t.
+    """
 
     def __init__(self, n: int, parameterization: str = "euler"):
-        count, self.rotation = ROTATIONS[parameterization]
-        super().__init__(f"SE({n})", count(n) + n, (n + 1, n + 1))
-        self.n = n
-        self.parameterization = parameterization
+        super().__init__("SE", n, parameterization, n_shifts=n)
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        angles, translation = params.split([self.num_params - self.n, self.n], dim=-1)
-        return self._assemble(self.rotation(angles, self.n), translation[..., None])
+        angles, shift = params.split([self.n_angles, self.n], dim=-1)
+        return th.cat([self.rotation(angles, self.n), shift[..., None]], dim=-1)  # (..., n, n + 1)
+
+    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
+        if not self._turns_plane:
+            return super().act_vjp(params, right)
+        angles, shift = params.split([self.n_angles, self.n], dim=-1)
+        rotated, pull_back_rotation = _rotate_plane(angles, right)
+
+        def pull_back(gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+            of_angles, of_right = pull_back_rotation(gradient)
+            return th.cat([of_angles, gradient[..., -1]], dim=-1), of_right
+
+        return rotated + F.pad(shift[..., None], (self.n, 0)), pull_back
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
-        rotation_inverse = element[..., :-1, :-1].mT
-        return self._assemble(rotation_inverse, -rotation_inverse @ element[..., :-1, -1:])
+        rotation_inverse = element[..., :-1].mT
+        return th.cat([rotation_inverse, -rotation_inverse @ element[..., -1:]], dim=-1)
 
     @property
     def for_actions(self) -> Group:
         return SE(self.n) if self.parameterization == "gram-schmidt" else self
-
-    def _assemble(self, rotation: th.Tensor, translation: th.Tensor) -> th.Tensor:
-        top = th.cat([rotation, translation], dim=-1)  # (..., n, n + 1)
-        return th.cat([top, _bottom_row(self.n, top.dtype, top.device).expand(*top.shape[:-2], 1, self.n + 1)], dim=-2)
-
-
-@cache
-def _bottom_row(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
-    with th.inference_mode(False):  # whoever calls first, it serves in training, too
-        return th.eye(n + 1, dtype=dtype)[-1:].to(device)
 
 
 class T(Group):
@@ -274,11 +361,13 @@ class MatrixLieGroup(MatrixGroup):
         self.generators = basis
         checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups
         d, m, _ = basis.shape
-        super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, (m, m))
+        is_affine = m > 1 and not bool(basis[:, -1].any())  # exp(A) of a last row of 0 has the last row 0 ... 0 1
+        super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, m, is_affine)
         self._placed: dict[tuple[th.dtype, th.device], th.Tensor] = {}
 
     def element(self, params: th.Tensor) -> th.Tensor:
         place = (params.dtype, params.device)
         if place not in self._placed:  # copied once per device, not once per step
             self._placed[place] = self.generators.to(dtype=params.dtype, device=params.device)
-        return th.matrix_exp(th.einsum("...d,dij->...ij", params, self._placed[place]))
+        matrix = th.matrix_exp(th.einsum("...d,dij->...ij", params, self._placed[place]))
+        return matrix[..., : self.element_shape[0], :]

@@ -25,11 +25,8 @@ class ProductGroup(Group):
         super().__init__(name, sum(group.num_params * count for group, count in self.factors), (sum(self._sizes),))
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        pieces = params.split([group.num_params * count for group, count in self.factors], dim=-1)
-        return self._flatten(
-            group.element(piece.unflatten(-1, (count, group.num_params)))
-            for (group, count), piece in zip(self.factors, pieces, strict=True)
-        )
+        pairs = zip(self.factors, self._split_params(params), strict=True)
+        return self._flatten(group.element(p) for (group, _), p in pairs)
 
     def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
         pairs = zip(self.factors, self._unflatten(left), self._unflatten(right), strict=True)
@@ -48,6 +45,11 @@ class ProductGroup(Group):
     @property
     def for_actions(self) -> Group:
         return ProductGroup([(group.for_actions, count) for group, count in self.factors])
+
+    def _split_params(self, params: th.Tensor) -> list[th.Tensor]:
+        pieces = params.split([group.num_params * count for group, count in self.factors], dim=-1)
+        pairs = zip(self.factors, pieces, strict=True)
+        return [piece.unflatten(-1, (count, group.num_params)) for (group, count), piece in pairs]
 
     def _unflatten(self, element: th.Tensor) -> list[th.Tensor]:
         pieces = element.split(self._sizes, dim=-1)

@@ -1,11 +1,15 @@
 """Layers that PyTorch does not have: noisy linear layers, the distributional head, whitening."""
 
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from math import sqrt
+from typing import Any
 
 import torch as th
 from torch import nn
 from torch.nn import functional as F
+
+Noise = tuple[th.Tensor, th.Tensor]  # f(ε_out), (out_features,), and f(ε_in), (in_features,), of one layer
 
 
 class NoisyLinear(nn.Module):
@@ -13,8 +17,8 @@ class NoisyLinear(nn.Module):
     Linear layer with factorised Gaussian noise (Fortunato et al. 2018, Eq. 9 to 11, https://arxiv.org/abs/1706.10295):
     y = (μ_w + σ_w ⊙ f(ε_out) f(ε_in)ᵀ) x + μ_b + σ_b ⊙ f(ε_out), with f(ε) = sign(ε) √|ε|.
 
-    Noise is asked for per call and drawn afresh each time, from torch's generator: it does not depend on train or eval
-    mode (SB3 explores in eval mode), and there is no noise to store. One draw serves the whole batch.
+    Noise is given per call (:func:`draw_noise`): it does not depend on train or eval mode (SB3 explores in eval mode), and
+    there is none to store. One draw serves the batch.
 
     :param in_features: size of the input
     :param out_features: size of the output
@@ -29,20 +33,63 @@ class NoisyLinear(nn.Module):
         self.weight_sigma = nn.Parameter(th.full((out_features, in_features), sigma_init * bound))
         self.bias_sigma = nn.Parameter(th.full((out_features,), sigma_init * bound))
 
-    def forward(self, inputs: th.Tensor, noisy: bool = False) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, noise: Noise | None = None) -> th.Tensor:
         """
-        :param inputs: (..., in_features)
-        :param noisy: whether to draw noise; without it, the mean weights
-        :return: (..., out_features)
+        :param inputs: (B, in_features)
+        :param noise: of this layer; ``None``: the mean weights
+        :return: (B, out_features)
         """
-        if not noisy:
+        if noise is None:
             return F.linear(inputs, self.weight, self.bias)
-        n_out, n_in = self.weight.shape
-        noise = th.randn(n_out + n_in, device=inputs.device, dtype=inputs.dtype)
-        noise_out, noise_in = th.copysign(noise.abs().sqrt(), noise).split([n_out, n_in])  # f(ε)
+        return _NoisyProduct.apply(inputs, self.weight, self.bias, self.weight_sigma, self.bias_sigma, *noise)
+
+
+class _NoisyProduct(th.autograd.Function):
+    """
+    The formula of :class:`NoisyLinear`. Its gradient by hand: that of σ_w is that of μ_w times the noise, one product, where
+    autograd makes two and a copy of matrices that are larger than the batch.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        inputs: th.Tensor,
+        weight: th.Tensor,
+        bias: th.Tensor,
+        weight_sigma: th.Tensor,
+        bias_sigma: th.Tensor,
+        noise_out: th.Tensor,
+        noise_in: th.Tensor,
+    ) -> th.Tensor:
+        noise = th.outer(noise_out, noise_in)
         # One product with the noisy matrix costs less than two with its parts, from a batch of some ten samples on.
-        weight = th.addcmul(self.weight, self.weight_sigma, th.outer(noise_out, noise_in))
-        return F.linear(inputs, weight, th.addcmul(self.bias, self.bias_sigma, noise_out))
+        noisy_weight = th.addcmul(weight, weight_sigma, noise)
+        ctx.save_for_backward(inputs, noisy_weight, noise, noise_out)
+        return F.linear(inputs, noisy_weight, th.addcmul(bias, bias_sigma, noise_out))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        inputs, noisy_weight, noise, noise_out = ctx.saved_tensors
+        of_weight, of_bias = gradient.mT @ inputs, gradient.sum(dim=0)
+        return gradient @ noisy_weight, of_weight, of_bias, of_weight * noise, of_bias * noise_out, None, None
+
+
+def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
+    """
+    Noise for one call of each layer, from torch's generator: f(ε) = sign(ε) √|ε| of all of them in one draw.
+
+    :param layers: at least one
+    """
+    sizes = [size for layer in layers for size in layer.weight.shape]
+    weight = layers[0].weight
+    noise = th.randn(sum(sizes), device=weight.device, dtype=weight.dtype)
+    pieces = th.copysign(noise.abs().sqrt_(), noise).split_with_sizes(sizes)
+    return list(zip(pieces[::2], pieces[1::2], strict=True))
+
+
+def make_linear(n_in: int, n_out: int, sigma_init: float | None) -> nn.Linear | NoisyLinear:
+    """A noisy layer, or without ``sigma_init`` a plain one."""
+    return nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
 
 
 class MLP(nn.Sequential):
@@ -57,13 +104,17 @@ class MLP(nn.Sequential):
     def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
         modules: list[nn.Module] = []
         for n_in, n_out in pairwise(sizes):
-            layer = nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
-            modules += [layer, activation_fn()]
+            modules += [make_linear(n_in, n_out, sigma_init), activation_fn()]
         super().__init__(*modules[:-1])
 
-    def forward(self, inputs: th.Tensor, noisy: bool = False) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, noise: Iterator[Noise] | None = None) -> th.Tensor:
+        """
+        :param inputs: (B, sizes[0])
+        :param noise: of the noisy layers one by one; ``None``: their mean weights
+        :return: (B, sizes[-1])
+        """
         for module in self:
-            inputs = module(inputs, noisy) if isinstance(module, NoisyLinear) else module(inputs)
+            inputs = module(inputs) if noise is None or not isinstance(module, NoisyLinear) else module(inputs, next(noise))
         return inputs
 
 
@@ -71,8 +122,8 @@ class DistributionalHead(nn.Module):
     """
     State features to ``n_atoms`` numbers (quantiles or logits) per action.
 
-    With ``dueling``, a value and an advantage stream, each an MLP of its own (Wang et al. 2016,
-    https://arxiv.org/abs/1511.06581); without it, the advantage stream alone is the head.
+    With ``dueling``, a value and an advantage stream (Wang et al. 2016, https://arxiv.org/abs/1511.06581); without it, the
+    advantage stream alone is the head. The first layers of both are one layer, twice as wide: one product is faster than two.
 
     :param features_dim: D
     :param n_actions: A
@@ -96,31 +147,38 @@ class DistributionalHead(nn.Module):
         super().__init__()
         self.n_atoms = n_atoms
         self.n_actions = n_actions
-        self.advantage = MLP([features_dim, *net_arch, n_actions * n_atoms], activation_fn, sigma_init)
-        self.value = MLP([features_dim, *net_arch, n_atoms], activation_fn, sigma_init) if dueling else None
+        sizes = [n_actions * n_atoms, n_atoms] if dueling else [n_actions * n_atoms]  # of the streams' outputs
+        widths = [width * len(sizes) for width in net_arch[:1]]
+        self.first = MLP([features_dim, *widths], activation_fn, sigma_init)
+        streams = [MLP([*(net_arch or [features_dim]), size], activation_fn, sigma_init) for size in sizes]
+        self.advantage, self.value = streams[0], streams[1] if dueling else None
+        self.activation = activation_fn()
+        modules = [self.first, *streams]
+        self._noisy_layers = [layer for module in modules for layer in module if isinstance(layer, NoisyLinear)]
 
     def forward(self, features: th.Tensor, noisy: bool = False) -> th.Tensor:
         """
         :param features: (B, D)
-        :param noisy: draw noise in noisy layers
+        :param noisy: draw noise in noisy layers; one draw serves the batch
         :return: (B, N, A)
         """
-        advantage = self.advantage(features, noisy).view(-1, self.n_atoms, self.n_actions)
+        noise = iter(draw_noise(self._noisy_layers)) if noisy and self._noisy_layers else None
+        hidden = self.activation(self.first(features, noise)) if len(self.first) else features
         if self.value is None:
-            return advantage
-        value = self.value(features, noisy)[:, :, None]  # (B, N, 1)
+            return self.advantage(hidden, noise).view(-1, self.n_atoms, self.n_actions)
+        of_advantage, of_value = hidden.chunk(2, dim=1) if len(self.first) else (hidden, hidden)
+        advantage = self.advantage(of_advantage, noise).view(-1, self.n_atoms, self.n_actions)
+        value = self.value(of_value, noise)[:, :, None]  # (B, N, 1)
         return value + advantage - advantage.mean(dim=2, keepdim=True)
 
     def project(self, features: th.Tensor) -> th.Tensor:
         """
         The projection p of the AET loss: the first layer of every stream, before its activation, noise off (appendix B.4).
 
-        :param features: (..., D)
-        :return: (..., P): P is the first hidden size, twice that if dueling
+        :param features: (N, D)
+        :return: (N, P): P is the first hidden size, twice that if dueling
         """
-        streams = [self.advantage] if self.value is None else [self.value, self.advantage]
-        rows = features.flatten(0, -2)  # a linear layer is slower on more than two dimensions
-        return th.cat([stream[0](rows) for stream in streams], dim=-1).unflatten(0, features.shape[:-1])
+        return self.first(features)
 
 
 class Whitening(nn.Module):

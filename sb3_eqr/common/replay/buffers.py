@@ -261,7 +261,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         return self._tensor(observations)
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
-        return th.as_tensor(array, device=self.device)  # arrays here are copies already
+        tensor = th.from_numpy(array)  # arrays here are copies already
+        return tensor if self.device.type == "cpu" else tensor.to(self.device)
 
     def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
         shape = (self.n_envs, *store.obs_shape)
