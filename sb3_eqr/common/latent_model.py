@@ -11,6 +11,7 @@ from typing import Any
 
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group
 from sb3_eqr.common.losses import contrastive_loss, normalized_distance, reward_cross_entropy, reward_mse
@@ -131,15 +132,8 @@ class LatentModel(nn.Module):
 
     def action_params(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """κ(x, a), or κ(a): a state, (B, D), and actions, int64, (B,), to parameters of K elements, (B, K * num_params)."""
-        first, *rest = self.transition
-        columns = first.weight.mT  # (D + A, H): of the state's entries, if it counts, and of the actions
-        n_state = first.in_features - self.n_actions
-        hidden = columns[n_state:][actions] + first.bias  # (B, H)
-        if n_state > 0:
-            hidden = th.addmm(hidden, state, columns[:n_state])
-        for module in rest:
-            hidden = module(hidden)
-        return hidden
+        one_hot = F.one_hot(actions, self.n_actions).to(state.dtype)  # (B, A)
+        return self.transition(th.cat([state, one_hot], dim=1) if self.state_dependent_actions else one_hot)
 
     def action_element(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """κ(x, a), or κ(a), as K group elements: a state, (B, D), and actions, int64, (B,), to (B, K, *element_shape)."""

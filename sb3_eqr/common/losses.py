@@ -76,12 +76,10 @@ def quantile_huber_loss(current: th.Tensor, target: th.Tensor) -> th.Tensor:
     :return: (B,)
     """
     n_quantiles = current.shape[1]
-    midpoints = (th.arange(n_quantiles, device=current.device, dtype=th.float) + 0.5) / n_quantiles  # (N,)
-    delta = target[:, None, :] - current[:, :, None]  # (B, N, N')
-    abs_delta = delta.abs()
-    huber = th.where(abs_delta > 1, abs_delta - 0.5, delta**2 * 0.5)
-    asymmetry = (midpoints[None, :, None] - (delta.detach() < 0).float()).abs()
-    return (asymmetry * huber).sum(dim=1).mean(dim=1)
+    midpoints = ((th.arange(n_quantiles, device=current.device, dtype=th.float) + 0.5) / n_quantiles)[:, None]  # (N, 1)
+    predicted, wanted = th.broadcast_tensors(current[:, :, None], target[:, None, :])  # (B, N, N')
+    weights = th.where(wanted < predicted, 1 - midpoints, midpoints)  # |τ - 1{u < 0}|
+    return (weights * F.huber_loss(predicted, wanted, reduction="none")).sum(dim=1).mean(dim=1)
 
 
 def categorical_projection(values: th.Tensor, probabilities: th.Tensor, v_min: float, v_max: float) -> th.Tensor:
@@ -100,8 +98,8 @@ def categorical_projection(values: th.Tensor, probabilities: th.Tensor, v_min: f
     # In units of atoms, so that the two shares of a value add up to 1 exactly.
     positions = ((values - v_min) * ((n_atoms - 1) / (v_max - v_min))).clamp(0, n_atoms - 1)  # (B, N)
     atoms = th.arange(n_atoms, device=values.device, dtype=values.dtype)  # (N,)
-    shares = (1 - (positions[:, :, None] - atoms).abs()).clamp(min=0)  # (B, N, N): of each value, to each atom
-    return (probabilities[:, :, None] * shares).sum(dim=1)  # no matrix product: it may be of lower precision on GPU
+    shares = th.rsub((positions[:, :, None] - atoms).abs_(), 1).clamp_(min=0)  # (B, N, N): of each value, to each atom
+    return shares.mul_(probabilities[:, :, None]).sum(dim=1)  # no matrix product: it may be of lower precision on GPU
 
 
 def categorical_loss(logits: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -116,13 +116,13 @@ class Objective:
         outputs = online.head(th.cat(states), noisy=True)  # (B or 2 B, N, A)
         with th.no_grad():
             next_outputs = target.head(following.next_state, noisy=True)  # (B, N, A)
-            chooser = outputs[n_samples:] if self.double_q else next_outputs
-            next_actions = online.expectation(chooser).argmax(dim=1, keepdim=True)  # (B, 1)
-            next_best = of_actions(next_outputs, next_actions)  # (B, N)
+            values = online.expectation(outputs.detach())  # (B or 2 B, A)
+            next_values = values[n_samples:] if self.double_q else target.expectation(next_outputs)
+            next_best = of_actions(next_outputs, next_values.argmax(dim=1, keepdim=True))  # (B, N)
             discounts = th.addcmul(samples.discounts, samples.discounts, samples.dones, value=-1)  # (B, 1): 0 at the end
         current = of_actions(outputs[:n_samples], samples.actions)  # (B, N)
         loss, priorities = online.td_loss(current, next_best, samples.rewards, discounts)
-        return loss, priorities, online.expectation(current.detach())
+        return loss, priorities, values.gather(1, samples.actions).squeeze(dim=1)
 
     def _latent_losses(
         self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following, coefs: LossCoefs

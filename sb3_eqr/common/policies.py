@@ -280,10 +280,10 @@ class EqRPolicy(BasePolicy):
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
                 th._foreach_add_(target, online, alpha=tau)
-            else:
+                target, online = [], []
+            target, online = target + target_statistics, online + online_statistics
+            if target:  # statistics are copied in any case, see https://github.com/DLR-RM/stable-baselines3/issues/996
                 th._foreach_copy_(target, online)
-            if online_statistics:  # they are copied, see https://github.com/DLR-RM/stable-baselines3/issues/996
-                th._foreach_copy_(target_statistics, online_statistics)
 
     def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """

@@ -21,7 +21,7 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :return: (..., n, n)
     """
     if n == 2:  # one plane: there is nothing to multiply
-        return _PlaneRotation.apply(angles)
+        return _PlaneRotation.apply(angles) if th.is_grad_enabled() else _plane_rotation(angles)
     cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # (..., planes, 1)
     columns = list(th.eye(n, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], n, n).unbind(-1))
     for plane, (i, j) in enumerate(_planes(n)):  # multiplying by R^{ij} from the right mixes columns i and j

@@ -25,6 +25,8 @@ class NoisyLinear(nn.Module):
     :param sigma_init: σ₀, ≥ 0; 0.5 in the paper and in Table 5
     """
 
+    SMALL_BATCH = 10  # below it, two products with vectors cost less than one with a noisy matrix, which has to be made
+
     def __init__(self, in_features: int, out_features: int, sigma_init: float = 0.5):
         super().__init__()
         bound = 1 / sqrt(in_features)
@@ -41,6 +43,10 @@ class NoisyLinear(nn.Module):
         """
         if noise is None:
             return F.linear(inputs, self.weight, self.bias)
+        if len(inputs) < self.SMALL_BATCH:
+            noise_out, noise_in = noise
+            noisy = F.linear(inputs * noise_in, self.weight_sigma, self.bias_sigma)
+            return th.addcmul(F.linear(inputs, self.weight, self.bias), noisy, noise_out)
         return _NoisyProduct.apply(inputs, self.weight, self.bias, self.weight_sigma, self.bias_sigma, *noise)
 
 
@@ -62,7 +68,6 @@ class _NoisyProduct(th.autograd.Function):
         noise_in: th.Tensor,
     ) -> th.Tensor:
         noise = th.outer(noise_out, noise_in)
-        # One product with the noisy matrix costs less than two with its parts, from a batch of some ten samples on.
         noisy_weight = th.addcmul(weight, weight_sigma, noise)
         ctx.save_for_backward(inputs, noisy_weight, noise, noise_out)
         return F.linear(inputs, noisy_weight, th.addcmul(bias, bias_sigma, noise_out))

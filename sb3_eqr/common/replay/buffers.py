@@ -370,7 +370,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         New priorities p ≥ 0 of samples, (B,), by their ``indices``, (B,). Those that are not finite are left out, and samples
         that cannot be drawn any more.
         """
-        scaled = (priorities.cpu().numpy().astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
+        scaled = (priorities.numpy(force=True).astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
         # A start that was overwritten, or has no whole window any more, stays at 0.
         takes_part = np.isfinite(scaled) & (self._tree.get(indices) > 0)
         if not takes_part.all():
