@@ -40,7 +40,7 @@ def draw(model: EqRQRDQN, states: th.Tensor, positions: np.ndarray, path: pathli
     """
     blocks = split(model, states)[0]
     linear, shift = frame(blocks.group, blocks.elements)  # (N, K, 2, 2), (N, K, 2)
-    moves = split(model, action_elements(model, states[:1]))[0]  # κ(a), (1, A, K, 3, 3)
+    moves = split(model, action_elements(model, states[:1]))[0]  # κ(a), (1, A, K, 2, 3)
     turned, moved = frame(moves.group, moves.elements)
     assert linear is not None and shift is not None and turned is not None and moved is not None
     figure, panels = plt.subplots(N_BLOCKS, 3, figsize=(11, 3.3 * N_BLOCKS), layout="constrained", squeeze=False)

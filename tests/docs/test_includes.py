@@ -49,23 +49,20 @@ PROMISES: dict[str, dict[str, Promise]] = {
             ),
             text=("`Objective.__call__`", "`reward_coef`", "`aet_coef`", "`symmetry_coef`", "`td_coef`", "$w_i$"),
         ),
-        "sb3_eqr/common/latent_model.py, LatentModel.rollout": Promise(
-            code=("self.act(self.action_element(state, action), state)", "th.stack(states, dim=1)"),
-            text=("`LatentModel.rollout`", r"\hat x_m = \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}"),
+        "sb3_eqr/common/rollout.py, _Rollout.forward": Promise(
+            code=("th.addmm(offset, states[-1], transposed)", "group.act_vjp(params.view(", "th.stack(states[1:], dim=1)"),
+            text=("`rollout` in `sb3_eqr/common/rollout.py`", r"= \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}"),
         ),
-        "sb3_eqr/common/losses.py, normalized_distance": Promise(
-            code=("F.normalize(prediction, dim=-1) - F.normalize(target, dim=-1)", "difference.square().sum(dim=-1)"),
+        "sb3_eqr/common/losses.py, _NormalizedDistance.forward": Promise(
+            code=("difference = directions[0] - directions[1]", "difference.square().sum(dim=-1)"),
             text=("`normalized_distance`", r"\rVert_2^2 = 2 - 2 \cos(y, \bar y)"),
         ),
-        "sb3_eqr/common/latent_model.py, if project is not None:": Promise(
-            code=(
-                "target_project(target_states[:, 1:])",
-                "AET_LOSSES[self.aet_loss](project(predicted), target_projected, mask)",
-            ),
+        "sb3_eqr/common/latent_model.py, if project is not None and": Promise(
+            code=("target_project(target_rollout.flatten(", "AET_LOSSES[self.aet_loss](projected, target_projected, mask)"),
             text=("`LatentModel.forward`", "`AET_LOSSES`", r"L_{\mathrm{AET}}"),
         ),
         "sb3_eqr/common/networks/layers.py, DistributionalHead.project": Promise(
-            code=("[self.advantage] if self.value is None else [self.value, self.advantage]", "stream[0](rows)"),
+            code=("def project(self", "return self.first(features)"),
             text=("`DistributionalHead.project`", "first layer of the Q head"),
         ),
         "sb3_eqr/common/losses.py, contrastive_loss": Promise(
@@ -73,11 +70,11 @@ PROMISES: dict[str, dict[str, Promise]] = {
             text=("`contrastive_loss`", '`policy_kwargs=dict(aet_loss="contrastive")`', r"\sum_{j=1}^{B} \exp"),
         ),
         "sb3_eqr/common/latent_model.py, LatentModel._symmetry_loss": Promise(
-            code=("symmetry = self.group.compose(self.blocks(partner), inverse)", "self.action_symmetry(", "th.no_grad()"),
+            code=("self.group.compose(self.blocks(partner), self.group.inverse(", "self.action_symmetry(", "th.no_grad()"),
             text=("`LatentModel._symmetry_loss`", "`symmetry_coef`", r"\tau_g = \bar x^{(j)}_0 \, x_0^{-1}"),
         ),
         "sb3_eqr/common/losses.py, reward_mse": Promise(
-            code=("(prediction.squeeze(-1) - reward).square()",),
+            code=("F.mse_loss(prediction.squeeze(-1), reward",),
             text=("`reward_mse`", r"\left(r_\psi(\hat x_m) - r_{t+m}\right)^2"),
         ),
         "sb3_eqr/common/losses.py, reward_cross_entropy": Promise(
@@ -86,9 +83,9 @@ PROMISES: dict[str, dict[str, Promise]] = {
         ),
         "sb3_eqr/common/objective.py, Objective._td_terms": Promise(
             code=(
-                "online.head(chooser_state, noisy=True) if self.double_q else next_outputs",
-                "online.expectation(chooser).argmax(dim=1",
-                "online.td_loss(current, following, samples.rewards, discounts)",
+                "values[n_samples:] if self.double_q else target.expectation(next_outputs)",
+                "of_actions(next_outputs, next_values.argmax(dim=1",
+                "online.td_loss(current, next_best, samples.rewards, discounts)",
             ),
             text=("`Objective._td_terms`", "`double_q`", "`td_loss`"),
         ),
@@ -97,26 +94,26 @@ PROMISES: dict[str, dict[str, Promise]] = {
             text=("`EqRQuantileNetwork.td_loss`", "The priority of a sample is its loss", "`following`"),
         ),
         "sb3_eqr/common/losses.py, quantile_huber_loss": Promise(
-            code=("abs_delta - 0.5, delta**2 * 0.5", "(asymmetry * huber).sum(dim=1).mean(dim=1)"),
+            code=("th.where(wanted < predicted, 1 - midpoints, midpoints)", 'reduction="none")).sum(dim=1).mean(dim=1)'),
             text=("`quantile_huber_loss`", r"\mathcal{H}(y_j - \theta_i)"),
         ),
         "sb3_eqr/eqr_rainbow/policies.py, EqRCategoricalNetwork.td_loss": Promise(
-            code=("values = rewards + discounts * self.support", "return categorical_loss(current, target)"),
+            code=("values = th.addcmul(rewards, discounts, self.support)", "return categorical_loss(current, target)"),
             text=("`EqRCategoricalNetwork.td_loss`", "`v_min`", "`v_max`"),
         ),
         "sb3_eqr/common/losses.py, categorical_projection": Promise(
-            code=(".clamp(0, n_atoms - 1)", "(probabilities[:, :, None] * shares).sum(dim=1)"),
+            code=(".clamp(0, n_atoms - 1)", "shares.mul_(probabilities[:, :, None]).sum(dim=1)"),
             text=("`categorical_projection`", r"\Delta z = (v_{\max} - v_{\min}) / (N - 1)"),
         ),
         "sb3_eqr/common/losses.py, categorical_loss": Promise(
-            code=("-(target * logits.log_softmax(dim=1)).sum(dim=1)", "th.xlogy(target, target)"),
+            code=('F.cross_entropy(logits, target, reduction="none")', "th.xlogy(target, target)"),
             text=("`categorical_loss`", "cross-entropy", "KL divergence"),
         ),
         "sb3_eqr/common/eqr_algorithm.py, EqRAlgorithm.train": Promise(
             code=(
                 "buffer.sample(batch_size",
-                "terms.loss.backward()",
-                "clip_grad_norm_(self._trained, max_norm)",
+                "assign_gradients(terms.loss, self._trained)",
+                "clip_grad_norm(self._trained, self.max_grad_norm)",
                 "optimizer.step()",
                 "policy.update_target(self.tau)",
                 "buffer.update_priorities(samples.indices, terms.priorities)",
@@ -182,8 +179,8 @@ def test_a_promise_is_kept_by_one_include_only():
 
 TAMPERED = {  # what goes wrong with a page -> a replacement in it, what it raises
     "another function": ("pyobject: reward_mse", "pyobject: normalized_distance", AssertionError),
-    "a function that is gone": ("pyobject: LatentModel.rollout", "pyobject: LatentModel.unroll", ValueError),
-    "a line that is gone": ("start-at: if project is not None:", "start-at: if project is not nothing:", ValueError),
+    "a function that is gone": ("pyobject: _Rollout.forward", "pyobject: LatentModel.unroll", ValueError),
+    "a line that is gone": ("start-at: if project is not None and", "start-at: if project is not nothing:", ValueError),
     "more than one statement": ("end-before: if target is not None:", "end-before: return LatentLosses", AssertionError),
     "half a statement": ("end-before: if target is not None:", "end-before: target_projected =", SyntaxError),
     "line numbers": (":pyobject: reward_mse", ":lines: 3-9", AssertionError),

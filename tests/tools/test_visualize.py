@@ -221,7 +221,7 @@ def test_pictures_have_one_scale_and_room_for_what_they_show():
 @pytest.mark.parametrize("label, colours", [("angle", "twilight"), ("position 0", "twilight"), ("velocity", "viridis")])
 def test_factors_that_go_round_have_colours_that_do(label, colours):
     model = make_model(group="SE(2)")
-    figure = latent_figure(model, th.randn(9, 18, generator=th.Generator().manual_seed(0)), np.arange(9.0), label)
+    figure = latent_figure(model, th.randn(9, 12, generator=th.Generator().manual_seed(0)), np.arange(9.0), label)
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
 
 
