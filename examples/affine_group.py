@@ -67,6 +67,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/affine_group"), help="folder")
     args = parser.parse_args()
+    th.set_num_threads(1)  # small networks are slower on two
     args.out.mkdir(parents=True, exist_ok=True)
     register()
     env = make_vec_env("SlidingBallTorus-v0", 16, args.seed)

@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5_500, help="of random play")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/pendulum.jsonl"), help="a line per run")
     args = parser.parse_args()
+    th.set_num_threads(1)  # small networks are slower on two
     register()
     args.out.parent.mkdir(parents=True, exist_ok=True)
     for group in args.groups:

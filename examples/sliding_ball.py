@@ -217,6 +217,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5_500, help="of random play; one update for each after the first 3000")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="folder")
     args = parser.parse_args()
+    th.set_num_threads(1)  # small networks are slower on two
     register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"

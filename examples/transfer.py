@@ -14,6 +14,7 @@ import pathlib
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecTransposeImage
@@ -118,6 +119,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3_000, help="of each agent")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/transfer"), help="folder")
     args = parser.parse_args()
+    th.set_num_threads(1)  # small networks are slower on two
     register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"

@@ -1,6 +1,7 @@
 """What a user gets beside the code: hyperparameter files, examples, the README, the linter's picture of the house."""
 
 import inspect
+import os
 import pathlib
 import re
 import subprocess
@@ -72,3 +73,17 @@ def test_readme_example_runs(tmp_path, monkeypatch):
     assert "model.learn(100_000, progress_bar=True)" in code
     exec(code.replace("100_000", "30"), {})
     assert (tmp_path / "pong.zip").exists()
+
+
+@pytest.mark.parametrize("chosen", [None, "ACTIVE"])
+def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen):
+    """OpenMP reads the variable once, when PyTorch loads it; what the user has chosen stays."""
+    code = (
+        "import sys, os, atexit, sb3_eqr_command as command; print('torch' in sys.modules); sys.argv = ['sb3-eqr', '--help']; "
+    )
+    code += "atexit.register(lambda: print(os.environ['OMP_WAIT_POLICY'])); command.main()"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {"OMP_WAIT_POLICY": chosen} if chosen else {}
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    lines = found.stdout.splitlines()
+    assert lines[0] == "False" and lines[-1] == (chosen or "PASSIVE") and "usage" in found.stdout
