@@ -1,5 +1,5 @@
 """
-Loss terms and gradients of an update as one CUDA graph: one launch where eager PyTorch makes some two thousand.
+Loss terms and gradients of an update as one CUDA graph: one launch where eager PyTorch makes some thousand.
 
 Experimental: it has not been measured on a GPU yet. All that this package knows of CUDA graphs is in this file.
 """

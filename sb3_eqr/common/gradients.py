@@ -8,7 +8,7 @@ from torch import nn
 
 def clip_grad_norm(parameters: Iterable[nn.Parameter], max_norm: float | None) -> th.Tensor:
     """
-    As PyTorch's ``clip_grad_norm_``, for parameters of one device and dtype, in a tenth of its operations.
+    As PyTorch's ``clip_grad_norm_``, for parameters of one device and dtype, in a fifth of its operations.
 
     :param parameters: those without a gradient are left out; at least one has one
     :param max_norm: of all gradients together, > 0; ``None``: nothing is clipped
