@@ -43,13 +43,18 @@ def _rotate_plane(angles: th.Tensor, columns: th.Tensor) -> tuple[th.Tensor, Gra
     """
     rotation = _plane_rotation(angles)
     rotated = rotation @ columns
-    return rotated, lambda gradient: (_gradient_of_angles(gradient, rotated), rotation.mT @ gradient)
+    turned = _turned(rotated)
+    return rotated, lambda gradient: (_gradient_of_angles(gradient, turned), rotation.mT @ gradient)
 
 
-def _gradient_of_angles(gradient: th.Tensor, rotated: th.Tensor) -> th.Tensor:
-    """From that of R(θ) S, and R(θ) S, (..., 2, n) each, to that of θ, (..., 1)."""
-    plane = _skew_basis(2, rotated.dtype, rotated.device)  # E, (1, 2, 2)
-    return (gradient * (plane @ rotated)).sum(dim=(-2, -1))[..., None]
+def _turned(rotated: th.Tensor) -> th.Tensor:
+    """The derivative of R(θ) S by θ: E R(θ) S, (..., 2, n)."""
+    return _skew_basis(2, rotated.dtype, rotated.device) @ rotated
+
+
+def _gradient_of_angles(gradient: th.Tensor, turned: th.Tensor) -> th.Tensor:
+    """From the gradient of R(θ) S and its derivative, (..., 2, n) each, to that of θ, (..., 1)."""
+    return (gradient * turned).sum(dim=(-2, -1))[..., None]
 
 
 class _PlaneRotation(th.autograd.Function):
@@ -64,13 +69,8 @@ class _PlaneRotation(th.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
-        return _gradient_of_angles(gradient, *ctx.saved_tensors)
-
-
-@cache
-def _eye(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
-    with th.inference_mode(False):  # whoever calls first, it serves in training, too
-        return th.eye(n, dtype=dtype).to(device)
+        (rotation,) = ctx.saved_tensors
+        return _gradient_of_angles(gradient, _turned(rotation))
 
 
 def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
@@ -161,7 +161,8 @@ class MatrixGroup(Group):
         if not self.is_affine:
             return element
         m = element.shape[-1]
-        return th.cat([element, _eye(m, element.dtype, element.device)[-1:].expand(*element.shape[:-2], 1, m)], dim=-2)
+        bottom = _bottom_row(m, element.dtype, element.device).expand(*element.shape[:-2], 1, m)
+        return th.cat([element, bottom], dim=-2)
 
     def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
         return left @ self.matrix(right)  # [A, t] [[A', t'], [0, 1]] = [A A', A t' + t]
@@ -171,6 +172,12 @@ class MatrixGroup(Group):
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         return th.eye(*self.element_shape, dtype=dtype, device=device).expand(*batch, *self.element_shape)
+
+
+@cache
+def _bottom_row(m: int, dtype: th.dtype, device: th.device) -> th.Tensor:
+    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+        return th.eye(m, dtype=dtype)[-1:].to(device)
 
 
 # An inverse is replaced by its damped form where the condition number exceeds the inverse of this many
@@ -281,7 +288,8 @@ class SE(_Rotations):
             of_angles, of_right = pull_back_rotation(gradient)
             return th.cat([of_angles, gradient[..., -1]], dim=-1), of_right
 
-        return rotated + F.pad(shift[..., None], (self.n, 0)), pull_back
+        rotated[..., -1].add_(shift)  # [R R', R t' + t]
+        return rotated, pull_back
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
         rotation_inverse = element[..., :-1].mT
