@@ -47,7 +47,7 @@ def make_agent(goal: str, seed: int, frozen: bool) -> EqRQRDQN:
         learning_starts=300,
         gradient_steps=1,
         n_steps=3,
-        aet_coef=0.0 if frozen else 1.0,
+        aet_coef=0.0 if frozen else 5.0,
         symmetry_coef=0.0,
         exploration_fraction=0.15,
         shift_pixels=0,

@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_eqr.common.groups import Group
+from sb3_eqr.common.latent_model import GroupLatentModel
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
@@ -35,6 +36,7 @@ class StillActions(BaseCallback):
 
     def _on_training_start(self) -> None:
         latent_model = self.model.policy.latent_model
+        assert isinstance(latent_model, GroupLatentModel)
         *_, output = latent_model.transition.children()
         assert isinstance(output, nn.Linear)
         identity = latent_model.group.identity_params().repeat(latent_model.n_blocks)
@@ -131,6 +133,7 @@ def train_representation(
         exploration_final_eps=1.0,
         prediction_depth=prediction_depth,
         td_coef=0.0,
+        aet_coef=float(prediction_depth),  # the sum over the steps, beside the one step of GET
         symmetry_coef=symmetry_coef,
         reward_coef=0.0,
         prioritized_replay=False,

@@ -78,6 +78,7 @@ class CapturedGradients:
         return (
             coefs,
             self._policy.target_encodes_as_online,
+            self._policy.latent_target_encodes_as_online,
             tuple((tensor.shape, tensor.dtype) for tensor in _tensors(samples)),
             tuple((parameter.requires_grad, parameter.data_ptr()) for parameter in self._parameters),
         )

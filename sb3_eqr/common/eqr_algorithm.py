@@ -20,7 +20,8 @@ from sb3_eqr.common import validation
 from sb3_eqr.common.cuda_graph import CapturedGradients
 from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
-from sb3_eqr.common.policies import EqRPolicy, find_optimizer
+from sb3_eqr.common.optimizers import set_adam_defaults
+from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
 from sb3_eqr.common.save_util import SafeFiles, read_description
@@ -76,10 +77,11 @@ class EqRAlgorithm(SafeFiles):
         exploration_final_eps: float = 0.0,
         max_grad_norm: float | None = 10.0,
         prediction_depth: int = 5,
-        aet_coef: float = 1.0,
+        aet_coef: float = 5.0,
         symmetry_coef: float = 1.0,
-        reward_coef: float = 1.0,
+        reward_coef: float = 5.0,
         td_coef: float = 1.0,
+        aux_gradient_share: float | None = None,
         double_q: bool = True,
         prioritized_replay: bool = True,
         shift_pixels: int = 4,
@@ -95,7 +97,7 @@ class EqRAlgorithm(SafeFiles):
         _init_setup_model: bool = True,
     ):
         """
-        Default hyperparameters are those of the paper for Atari 100K (Table 5).
+        Default hyperparameters are those of the paper for Atari 100K (Table 5; its losses are sums over M = 5 steps, ours means).
 
         :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
@@ -120,10 +122,12 @@ class EqRAlgorithm(SafeFiles):
         :param exploration_final_eps: final value of random action probability
         :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
         :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
-        :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss; 0 switches it off
+        :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 switches it off
         :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
-        :param reward_coef: λ₁ ≥ 0, weight of the reward loss; 0 switches it off
+        :param reward_coef: λ₁ ≥ 0, weight of the reward loss, likewise; 0 switches it off
         :param td_coef: ≥ 0, weight of the TD loss; 0: no Q-learning, the representation alone is trained, priorities stay
+        :param aux_gradient_share: largest norm of the auxiliary losses' gradient at the state, as a share of that of the TD
+            loss, ≥ 0: they are scaled down there where they exceed it; ``None``: no limit
         :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
         :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
         :param shift_pixels: random shift of images, in pixels; 0 switches it off
@@ -146,12 +150,7 @@ class EqRAlgorithm(SafeFiles):
         :raises AssertionError: if the action space is not Discrete (as SB3)
         """
         policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
-        policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
-        if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
-            # Epsilon of Table 5; one kernel for all parameters, on CPU and GPU, where PyTorch's default has six for each.
-            given = policy_kwargs.get("optimizer_kwargs") or {}
-            fused = get_device(device).type in ("cpu", "cuda") and not (given.get("foreach") or given.get("differentiable"))
-            policy_kwargs["optimizer_kwargs"] = {"eps": 1.5e-4, "fused": fused, **given}
+        set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]
             policy,
             env,
@@ -184,6 +183,7 @@ class EqRAlgorithm(SafeFiles):
         self.symmetry_coef = symmetry_coef
         self.reward_coef = reward_coef
         self.td_coef = td_coef
+        self.aux_gradient_share = aux_gradient_share
         self.double_q = double_q
         self.prioritized_replay = prioritized_replay
         self.shift_pixels = shift_pixels
@@ -217,7 +217,8 @@ class EqRAlgorithm(SafeFiles):
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
-        self.objective = Objective(self.policy, self.double_q, self.shift_pixels, self.intensity_scale)
+        augmentation = self.shift_pixels, self.intensity_scale
+        self.objective = Objective(self.policy, self.double_q, *augmentation, self.aux_gradient_share)
         self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
         keep_freed_memory()
 
@@ -232,6 +233,8 @@ class EqRAlgorithm(SafeFiles):
         for argument, least in {"prediction_depth": 0, "shift_pixels": 0, "batch_size": 1}.items():
             validation.check_number(argument, getattr(self, argument), least, whole=True)
         validation.check_number("tau", self.tau, 0, 1)
+        if self.aux_gradient_share is not None:
+            validation.check_number("aux_gradient_share", self.aux_gradient_share, 0)
         if self.target_update_interval is not None:
             validation.check_number("target_update_interval", self.target_update_interval, 1, whole=True)
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
@@ -344,7 +347,7 @@ class EqRAlgorithm(SafeFiles):
             grad_norm = clip_grad_norm(self._trained, self.max_grad_norm)
             optimizer.step()
             self._n_updates += 1
-            policy.target_is_copy = False
+            policy.after_gradient_step()
             if self.target_update_interval is None:
                 policy.update_target(self.tau)
             if terms.priorities is not None:

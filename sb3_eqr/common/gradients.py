@@ -1,9 +1,11 @@
 """From a loss to gradients within their norm, in few operations."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch as th
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 
 def clip_grad_norm(parameters: Iterable[nn.Parameter], max_norm: float | None) -> th.Tensor:
@@ -37,3 +39,39 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
             trained.append(parameter)
     for parameter, gradient in zip(trained, th.autograd.grad(loss, trained, allow_unused=True), strict=True):
         parameter.grad = gradient
+
+
+def branch(features: th.Tensor, state_dim: int, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Features for the TD loss and states for the auxiliary losses: the same numbers, but the gradients of both are told apart
+    where they meet, and the auxiliary one is scaled there so that its norm is at most a share of the TD loss's.
+
+    :param features: (B, F)
+    :param state_dim: D ≤ F; states are the first D features
+    :param share: ≥ 0; ``None``: nothing is scaled
+    :param gram: (2, 2), filled in by the backward pass: the inner products of TD and auxiliary gradient
+    :return: (B, F) and (B, D)
+    """
+    return _Branch.apply(features, state_dim, share, gram)
+
+
+class _Branch(th.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, features: th.Tensor, state_dim: int, share: float | None, gram: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        ctx.share, ctx.gram = share, gram
+        return features.view_as(features), features[:, :state_dim].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_td: th.Tensor, of_state: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        missing = of_td.shape[1] - of_state.shape[1]
+        auxiliary = nn.functional.pad(of_state, (0, missing)) if missing else of_state
+        both = th.stack([of_td.flatten(), auxiliary.flatten()])  # (2, B * F)
+        th.mm(both, both.mT, out=ctx.gram)
+        if ctx.share is None:
+            return of_td + auxiliary, None, None, None
+        squares = ctx.gram.diagonal()
+        scale = (ctx.share * (squares[0] / squares[1].clamp(min=1e-30)).sqrt()).clamp(max=1.0)
+        return th.addcmul(of_td, auxiliary, scale), None, None, None

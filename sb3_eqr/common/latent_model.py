@@ -31,49 +31,29 @@ AET_LOSSES: dict[str, Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]] = 
 
 class LatentModel(nn.Module):
     """
-    κ (actions to group elements), r_ψ (reward), ρ (how a symmetry of states acts on actions) and b (its projection).
+    The reward network r_ψ and the losses; how actions move states is a subclass's ``rollout``.
 
-    :param group: of each block
-    :param n_blocks: K
+    :param state_dim: D
     :param n_actions: A
-    :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
+    :param hidden_dim: width of the hidden layer of r_ψ
     :param reward_loss: "mse" (Eq. 17) or "categorical" (three signs, as in the authors' released code)
     :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
-    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2
     :raises ValueError: for an unknown loss
     """
 
-    def __init__(
-        self,
-        group: Group,
-        n_blocks: int,
-        n_actions: int,
-        hidden_dim: int = 256,
-        reward_loss: str = "mse",
-        aet_loss: str = "distance",
-        state_dependent_actions: bool = True,
-    ):
+    transition: Any  # its copy moves with the target
+    projection: nn.Module  # likewise: b of the GET loss
+    has_symmetry_loss = False
+
+    def __init__(self, state_dim: int, n_actions: int, hidden_dim: int, reward_loss: str, aet_loss: str):
         super().__init__()
         for name, found, legal in (("reward_loss", reward_loss, REWARD_LOSSES), ("aet_loss", aet_loss, AET_LOSSES)):
             if found not in legal:
                 raise ValueError(f"{name}: expected one of {list(legal)}, found {found!r}")
-        group = group.for_actions
-        self.group = group
-        self.n_blocks = n_blocks
         self.n_actions = n_actions
-        state_dim = n_blocks * prod(group.element_shape)
-        algebra_dim = n_blocks * group.num_params
-        self.state_dependent_actions = state_dependent_actions
-        if state_dependent_actions:
-            self.transition: Any = HiddenLayer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
-        else:  # without a norm: statistics of a batch of actions would move κ(a) with the draw
-            layers = nn.Linear(n_actions, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, algebra_dim)
-            self.transition = nn.Sequential(*layers)
         self.aet_loss = aet_loss
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
         self.reward_net = HiddenLayer(state_dim, hidden_dim, n_outputs)  # r_ψ
-        self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim)  # ρ
-        self.projection = nn.Linear(state_dim, hidden_dim)  # b
 
     def forward(
         self,
@@ -88,8 +68,8 @@ class LatentModel(nn.Module):
         target_project: Projection,
     ) -> LatentLosses:
         """
-        The losses of Eq. 18 and 19, per sample, each step weighted by the one mask. ``None`` for ``rewards``, ``target``
-        or ``project`` leaves the reward, the GET or the AET loss out.
+        The losses of Eq. 18 and 19, per sample; those of the rollout are means over its valid steps, where the paper writes
+        sums. ``None`` for ``rewards``, ``target`` or ``project`` leaves the reward, the GET or the AET loss out.
 
         :param state: x₀ = τ(s_t), online, (B, D)
         :param actions: a_t ... a_{t+M-1}, int64, (B, M)
@@ -106,18 +86,70 @@ class LatentModel(nn.Module):
         actions = actions * mask.long()  # (B, M)
         predicted = self.rollout(state, actions)  # (B, M, D)
         rows = predicted.flatten(0, 1)  # (B * M, D)
+        weights = mask / mask.sum(dim=1, keepdim=True).clamp(min=1)  # (B, M)
         aet = symmetry = reward = None
         if project is not None and target_rollout is not None:
             with th.no_grad():
                 target_projected = target_project(target_rollout.flatten(0, 1)).view(*mask.shape, -1)  # (B, M, P)
             projected = project(rows).view(*mask.shape, -1)  # (B, M, P)
-            aet = (AET_LOSSES[self.aet_loss](projected, target_projected, mask) * mask).sum(dim=1)
+            aet = (AET_LOSSES[self.aet_loss](projected, target_projected, mask) * weights).sum(dim=1)
         if target is not None:
-            symmetry = mask[:, 0] * self._symmetry_loss(state, predicted[:, 0], actions[:, 0], target_state, target)
+            symmetry = mask[:, 0] * self.symmetry_loss(state, predicted[:, 0], actions[:, 0], target_state, target)
         if rewards is not None:
             outputs = self.reward_net(rows).view(*mask.shape, -1)  # (B, M, 1 or 3)
-            reward = (self._reward_loss(outputs, rewards) * mask).sum(dim=1)
+            reward = (self._reward_loss(outputs, rewards) * weights).sum(dim=1)
         return LatentLosses(aet, symmetry, reward)
+
+    def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """From x₀, (B, D), and actions, int64, (B, M), to x̂_1 ... x̂_M, (B, M, D)."""
+        raise NotImplementedError
+
+    def symmetry_loss(
+        self, state: th.Tensor, predicted: th.Tensor, actions: th.Tensor, target_state: th.Tensor, target: Any
+    ) -> th.Tensor:
+        """The GET loss, where the model has one: from x₀, x̂₁ and x̄₀, (B, D) each, and a_t, (B,), to (B,)."""
+        raise NotImplementedError
+
+
+class GroupLatentModel(LatentModel):
+    """
+    κ (actions to group elements), ρ (how a symmetry of states acts on actions) and b (its projection), beside r_ψ.
+
+    :param group: of each block
+    :param n_blocks: K
+    :param n_actions: A
+    :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
+    :param reward_loss: as in :class:`LatentModel`
+    :param aet_loss: likewise
+    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2
+    :raises ValueError: for an unknown loss
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        n_blocks: int,
+        n_actions: int,
+        hidden_dim: int = 256,
+        reward_loss: str = "mse",
+        aet_loss: str = "distance",
+        state_dependent_actions: bool = True,
+    ):
+        group = group.for_actions
+        state_dim = n_blocks * prod(group.element_shape)
+        super().__init__(state_dim, n_actions, hidden_dim, reward_loss, aet_loss)
+        self.group = group
+        self.n_blocks = n_blocks
+        self.has_symmetry_loss = group.has_inverse
+        algebra_dim = n_blocks * group.num_params
+        self.state_dependent_actions = state_dependent_actions
+        if state_dependent_actions:
+            self.transition = HiddenLayer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
+        else:  # without a norm: statistics of a batch of actions would move κ(a) with the draw
+            layers = nn.Linear(n_actions, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, algebra_dim)
+            self.transition = nn.Sequential(*layers)
+        self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim)  # ρ
+        self.projection = nn.Linear(state_dim, hidden_dim)  # b
 
     def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -147,8 +179,8 @@ class LatentModel(nn.Module):
         """As :meth:`act`, of elements by their parameters, (B, K * num_params)."""
         return self.act(self.element(params), state)
 
-    def _symmetry_loss(
-        self, state: th.Tensor, predicted: th.Tensor, actions: th.Tensor, target_state: th.Tensor, target: "LatentModel"
+    def symmetry_loss(
+        self, state: th.Tensor, predicted: th.Tensor, actions: th.Tensor, target_state: th.Tensor, target: "GroupLatentModel"
     ) -> th.Tensor:
         """
         Eq. 19: τ_g moves the predicted next state x̂₁; ρ(τ_g) κ̄ moves the partner's state; both should arrive together. From

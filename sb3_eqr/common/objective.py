@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import is_image_space, preprocess_ob
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
+from sb3_eqr.common.gradients import branch
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 
@@ -35,6 +36,7 @@ class LossTerms(NamedTuple):
     loss: th.Tensor  # (): the mean of their sum, weighted by coefficients and replay weights (Eq. 21)
     priorities: th.Tensor | None = None  # (B,), ≥ 0, no gradient: new ones of the samples, by the TD loss
     q_values: th.Tensor | None = None  # (B,), no gradient: Q(s_t, a_t)
+    gram: th.Tensor | None = None  # (2, 2), of TD and auxiliary gradient at the state, after the backward pass
 
     def metrics(self) -> dict[str, th.Tensor]:
         """What is logged: scalars without gradient."""
@@ -43,7 +45,12 @@ class LossTerms(NamedTuple):
             terms["mean_q_value"] = self.q_values
         with th.no_grad():
             means = th.stack(list(terms.values())).mean(dim=1)
-        return {**dict(zip(terms, means.unbind(), strict=True)), "loss": self.loss.detach()}
+            metrics = {**dict(zip(terms, means.unbind(), strict=True)), "loss": self.loss.detach()}
+            if self.gram is not None:
+                td_norm, aux_norm = self.gram.diagonal().sqrt().unbind()
+                cosine = self.gram[0, 1] / (td_norm * aux_norm).clamp(min=1e-30)
+                metrics |= {"td_state_gradient": td_norm, "aux_state_gradient": aux_norm, "state_gradient_cosine": cosine}
+        return metrics
 
 
 class Following(NamedTuple):
@@ -63,47 +70,71 @@ class Objective:
     :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
     :param shift_pixels: random shift of images, in pixels, ≥ 0
     :param intensity_scale: random intensity of images, ≥ 0
+    :param aux_gradient_share: largest norm of the auxiliary losses' gradient at the state, as a share of the TD loss's;
+        ``None``: no limit
     """
 
-    def __init__(self, policy: EqRPolicy, double_q: bool, shift_pixels: int, intensity_scale: float):
+    def __init__(
+        self,
+        policy: EqRPolicy,
+        double_q: bool,
+        shift_pixels: int,
+        intensity_scale: float,
+        aux_gradient_share: float | None = None,
+    ):
         self.policy = policy
         self.double_q = double_q
+        self.aux_gradient_share = aux_gradient_share
         self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: LossCoefs) -> LossTerms:
         """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
-        # x₀, (B, D): TD and auxiliary losses meet here and nowhere else, so this is where their gradients can be weighed.
-        state = self.policy.online.features_extractor(observations)
+        features = self.policy.online.features_extractor(observations)
+        # x₀, (B, D): TD and auxiliary losses meet here and nowhere else, so this is where their gradients are weighed.
+        state, gram = features[:, : self.policy.state_dim], None
+        if coefs.td > 0 and samples.mask is not None:
+            gram = features.new_zeros(2, 2)
+            features, state = branch(features, self.policy.state_dim, self.aux_gradient_share, gram)
         following = self._encode_following(samples, observations, state, coefs)
         td = priorities = q_values = None
         if coefs.td > 0:
-            td, priorities, q_values = self._td_terms(samples, state, following)
+            td, priorities, q_values = self._td_terms(samples, features, following)
         latent = self._latent_losses(samples, state, following, coefs)
         terms = zip(coefs, (td, *latent), strict=True)
         weighted = [term if coef == 1 else coef * term for coef, term in terms if term is not None]
         loss = (samples.weights * sum(weighted[1:], weighted[0])).mean()
-        return LossTerms(td, *latent, loss, priorities, q_values)
+        return LossTerms(td, *latent, loss, priorities, q_values, gram)
 
     @th.no_grad()
     def _encode_following(
         self, samples: SequenceReplayBufferSamples, observations: PyTorchObs, state: th.Tensor, coefs: LossCoefs
     ) -> Following:
         """All that is encoded without gradient. The target copy sees s_t in the same augmentation as the online encoder."""
-        policy, shared = self.policy, self.policy.target_encodes_as_online
+        policy, dim = self.policy, self.policy.state_dim
         has_td, has_latent = coefs.td > 0, samples.mask is not None
-        batches = [self.augment(samples.next_observations)] if has_td else []
-        chooser = None
-        if has_td and self.double_q and not shared:
-            chooser = policy.online.features_extractor(batches[0])
-        batches += [observations] if has_latent and not shared else []
+        is_separate, as_online = policy.latent_target is not policy.target, policy.latent_target_encodes_as_online
+        of_target = [self.augment(samples.next_observations)] if has_td else []
+        of_latent = [observations] if has_latent and not as_online else []
+        chooser, needs_chooser = None, has_td and self.double_q and not policy.target_encodes_as_online
+        if needs_chooser and is_separate and as_online:
+            of_latent = of_target  # encodes as the online encoder, in one pass with the rollout
+        elif needs_chooser:
+            chooser = policy.online.features_extractor(of_target[0])
         rollout = [flat(samples.rollout_observations)] if has_latent and coefs.aet > 0 else []
-        pieces = map(self.augment, chain.from_iterable(map(in_pieces, rollout)))
-        passes = encode(policy.target.features_extractor, chain(batches, pieces))  # one tensor for each of the batches
+        pieces = chain(of_latent, map(self.augment, chain.from_iterable(map(in_pieces, rollout))))
+        encoder, latent_encoder = policy.target.features_extractor, policy.latent_target.features_extractor
+        passes: Iterator[th.Tensor]
+        if is_separate:
+            passes = chain(encode(encoder, of_target), encode(latent_encoder, pieces))
+        else:
+            passes = encode(encoder, chain(of_target, pieces))  # one tensor for each of the batches
         next_state = next(passes) if has_td else state.new_empty(0)
-        start = next(passes) if has_latent and not shared else state.detach()
+        if needs_chooser and chooser is None:
+            chooser = next(passes)
+        start = next(passes)[:, :dim] if has_latent and not as_online else state.detach()
         states = list(passes)
-        rolled = th.cat(states).view(*samples.mask.shape, -1) if states and samples.mask is not None else None
+        rolled = th.cat(states)[:, :dim].view(*samples.mask.shape, -1) if states and samples.mask is not None else None
         return Following(next_state, next_state if chooser is None else chooser, start, rolled)
 
     def _td_terms(

@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable
 from copy import deepcopy
-from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -13,11 +12,21 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import Group, NoGroup
-from sb3_eqr.common.latent_model import LatentModel, Projection
-from sb3_eqr.common.networks.encoders import DEFAULT_GROUP, ConvTrunk, GroupFeaturesExtractor, ImageExtractor, find_trunk
-from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening
+from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection
+from sb3_eqr.common.networks.encoders import (
+    DEFAULT_GROUP,
+    ConvTrunk,
+    GroupFeaturesExtractor,
+    ImageExtractor,
+    NormalizedExtractor,
+    find_trunk,
+)
+from sb3_eqr.common.networks.layers import DistributionalHead, Whitening
 from sb3_eqr.common.networks.q_networks import EqRNetwork
+from sb3_eqr.common.optimizers import decay_matrices_only, find_optimizer
+from sb3_eqr.common.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_names, check_number
 
@@ -26,8 +35,18 @@ Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
 PROJECTIONS = ("head", "own", "none")
-OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "dueling", "noisy", "sigma_init", "latent_hidden_dim"]
-OWN_ARGUMENTS += ["projection", "state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
+TRANSITIONS = ("group", "convolutional")
+OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "skip_connection", "dueling", "noisy"]
+OWN_ARGUMENTS += [
+    "sigma_init",
+    "transition",
+    "latent_hidden_dim",
+    "projection",
+    "predictor",
+    "latent_tau",
+    "state_dependent_actions",
+]
+OWN_ARGUMENTS += ["act_with_target", "reward_loss", "aet_loss"]
 
 
 class EqRPolicy(BasePolicy):
@@ -60,12 +79,21 @@ class EqRPolicy(BasePolicy):
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether the encoder's algebra parameters are whitened over the batch: states cannot collapse to a point, and
         blocks are driven apart; needs a group
+    :param layer_norm: whether layer norm stands behind the trunk, with a group and without
+    :param skip_connection: whether the Q head sees the trunk's features beside the state; needs a group, and
+        ``projection="own"`` for the AET loss
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
+    :param transition: how actions move states: "group", or "convolutional": SPR's network on the trunk's map of features
+        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), with ``group=None`` and an image trunk
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a layer of its own, or
         "none", the state itself (§5)
+    :param predictor: whether a linear layer stands behind p on the online side alone, as in SPR
+        (https://arxiv.org/abs/2007.05929): a target that is a copy then invites no collapse
+    :param latent_tau: how far the latent model's target (encoder, p̄, κ̄, b̄) moves after each gradient step, in [0, 1]; 1
+        copies, as in the paper. ``None``: it moves with the target of the Q head
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, whatever the state
     :param act_with_target: choose actions by the target network, which is steadier with ``tau`` < 1 (as SR-SPR,
         https://openreview.net/forum?id=OpC-9aBBVJe, and BBF do); else by the online network
@@ -84,7 +112,8 @@ class EqRPolicy(BasePolicy):
     latent_model_target: LatentModel
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
-    target_is_copy: bool  # whether the target copy equals the online networks now; a gradient step ends it
+    latent_network_target: EqRNetwork | None
+    state_dim: int  # D: what the latent model moves, the first features of the encoder
 
     def __init__(
         self,
@@ -102,11 +131,16 @@ class EqRPolicy(BasePolicy):
         n_blocks: int | None = None,
         parameterization: str = "euler",
         whiten: bool = False,
+        layer_norm: bool = False,
+        skip_connection: bool = False,
         dueling: bool = True,
         noisy: bool = True,
         sigma_init: float = 0.5,
+        transition: str = "group",
         latent_hidden_dim: int = 256,
         projection: str = "head",
+        predictor: bool = False,
+        latent_tau: float | None = None,
         state_dependent_actions: bool = True,
         act_with_target: bool = False,
         reward_loss: str = "mse",
@@ -122,12 +156,28 @@ class EqRPolicy(BasePolicy):
         check_number("sigma_init", sigma_init, 0)
         if whiten and group is None:
             raise ValueError("whiten: expected a group, whose parameters are whitened, found group=None. Pass whiten=False.")
+        if skip_connection and group is None:
+            raise ValueError(
+                "skip_connection: expected a group, beside whose elements the trunk's features stand, found group=None. "
+                "Pass skip_connection=False."
+            )
+        if transition not in TRANSITIONS:
+            raise ValueError(f"transition: expected one of {list(TRANSITIONS)}, found {transition!r}")
+        if transition == "convolutional" and group is not None:
+            raise ValueError(f'transition: expected group=None, whose features "convolutional" moves, found group={group!r}')
+        if latent_tau is not None:
+            check_number("latent_tau", latent_tau, 0, 1)
         if projection not in PROJECTIONS:
             raise ValueError(f"projection: expected one of {list(PROJECTIONS)}, found {projection!r}")
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
         self.whiten = whiten
+        self.layer_norm = layer_norm
+        self.skip_connection = skip_connection
+        self.predictor = predictor
+        self.latent_tau = latent_tau
+        self.transition = transition
         self._frozen: list[nn.Module] = []
         self.latent_hidden_dim = latent_hidden_dim
         self.dueling = dueling
@@ -168,12 +218,15 @@ class EqRPolicy(BasePolicy):
         if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
         if self.group is None:
-            return self.features_extractor_class(self.observation_space, **trunk_kwargs)
+            trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
+            return NormalizedExtractor(trunk) if self.layer_norm else trunk
         group_kwargs = {
             "group": self.group,
             "n_blocks": self.n_blocks,
             "parameterization": self.parameterization,
             "whiten": self.whiten,
+            "layer_norm": self.layer_norm,
+            "skip_connection": self.skip_connection,
             "normalized_image": not self.normalize_images,
         }
         if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
@@ -197,30 +250,29 @@ class EqRPolicy(BasePolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # type: ignore[misc]
         encoder = self.online.features_extractor
-        if isinstance(encoder, GroupFeaturesExtractor):
-            group, n_blocks = encoder.group, encoder.n_blocks
-        else:
-            group, n_blocks = NoGroup(encoder.features_dim), 1
-        losses = self.reward_loss, self.aet_loss
-        self.latent_model = LatentModel(
-            group, n_blocks, int(self.action_space.n), self.latent_hidden_dim, *losses, self.state_dependent_actions
-        ).to(self.device)
+        self.latent_model = self._make_latent_model(encoder).to(self.device)
         self.latent_model_target = _frozen_copy(self.latent_model)
         parameters = list(self.latent_model.parameters())
         self.own_projection = self.own_projection_target = None
         if self.projection == "own":
-            self.own_projection = nn.Linear(encoder.features_dim, self.latent_hidden_dim).to(self.device)
+            self.own_projection = nn.Linear(self.state_dim, self.latent_hidden_dim).to(self.device)
             self.own_projection_target = _frozen_copy(self.own_projection)
             parameters += self.own_projection.parameters()
+        self.predictor_net = None
+        if self.predictor:
+            width = {"own": self.latent_hidden_dim, "head": self.online.head.projection_dim, "none": self.state_dim}
+            self.predictor_net = nn.Linear(width[self.projection], width[self.projection]).to(self.device)
+            parameters += self.predictor_net.parameters()
+        self.latent_network_target = None if self.latent_tau is None else _frozen_copy(self.online)
         for module in self.modules():
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
         depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
         self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder.modules())
-        self.target_is_copy = True
+        self._make_target_copies()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
-        _decay_matrices_only(self)
+        decay_matrices_only(self, self.optimizer)
 
     @property
     def description(self) -> dict[str, str]:
@@ -228,17 +280,50 @@ class EqRPolicy(BasePolicy):
         encoder = self.online.features_extractor
         return {"group": encoder.description if isinstance(encoder, GroupFeaturesExtractor) else "no group"}
 
+    def _make_latent_model(self, encoder: BaseFeaturesExtractor) -> LatentModel:
+        sizes, losses = (int(self.action_space.n), self.latent_hidden_dim), (self.reward_loss, self.aet_loss)
+        if self.transition == "convolutional":
+            self.state_dim = encoder.features_dim
+            return ConvLatentModel(map_shape(encoder), *sizes, *losses)
+        blocks: tuple[Group, int] = NoGroup(encoder.features_dim), 1
+        self.state_dim = encoder.features_dim
+        if isinstance(encoder, GroupFeaturesExtractor):
+            blocks, self.state_dim = (encoder.group, encoder.n_blocks), encoder.state_dim
+        return GroupLatentModel(*blocks, *sizes, *losses, self.state_dependent_actions)
+
+    def _make_target_copies(self) -> None:
+        latents: list[tuple[nn.Module | None, nn.Module | None]] = [
+            (self.latent_network_target and self.online, self.latent_network_target),
+            (self.own_projection, self.own_projection_target),
+            (self.latent_model.transition, self.latent_model_target.transition),
+            (self.latent_model.projection, self.latent_model_target.projection),
+        ]
+        pairs = [(online, target) for online, target in latents if online is not None and target is not None]
+        if self.latent_tau is None:
+            self.target_copy = self.latent_target_copy = TargetCopy([(self.online, self.target), *pairs])
+        else:
+            self.target_copy, self.latent_target_copy = TargetCopy([(self.online, self.target)]), TargetCopy(pairs)
+
+    @property
+    def latent_target(self) -> EqRNetwork:
+        """The network whose encoder gives the latent model its targets."""
+        return self.latent_network_target or self.target
+
     @property
     def target_encodes_as_online(self) -> bool:
-        """Whether target features are online features, so that one pass serves for both."""
-        return self.target_is_copy and self._encoder_ignores_mode
+        """Whether features of the Q head's target are online features, so that one pass serves for both."""
+        return self.target_copy.is_exact and self._encoder_ignores_mode
+
+    @property
+    def latent_target_encodes_as_online(self) -> bool:
+        """The same of the latent model's target."""
+        return self.latent_target_copy.is_exact and self._encoder_ignores_mode
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """As PyTorch's, with the same parameters."""
         result = super().load_state_dict(*args, **kwargs)
-        online, target, online_statistics, target_statistics = self._target_tensors
-        pairs = zip([*online, *online_statistics], [*target, *target_statistics], strict=True)
-        self.target_is_copy = all(th.equal(*pair) for pair in pairs)
+        for copy in (self.target_copy, self.latent_target_copy):
+            copy.compare()
         return result
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
@@ -246,10 +331,15 @@ class EqRPolicy(BasePolicy):
 
     def check_losses(self, aet: bool, symmetry: bool) -> None:
         """Raise ValueError if this policy cannot serve the AET or the GET (``symmetry``) loss that is asked for."""
-        if symmetry and not self.latent_model.group.has_inverse:
+        if symmetry and not self.latent_model.has_symmetry_loss:
             raise ValueError(
                 f"symmetry_coef: the GET loss needs a group with inverses, found group={self.group!r}. "
                 "Pass symmetry_coef=0 or another group."
+            )
+        if aet and self.projection == "head" and self.skip_connection:
+            raise ValueError(
+                "projection: expected one that takes the state alone, as the Q head takes the trunk's features beside it; "
+                'found "head". Pass policy_kwargs={"projection": "own"}, or aet_coef=0.'
             )
         if aet and self.projection == "head" and not self.net_arch:
             raise ValueError(
@@ -259,13 +349,15 @@ class EqRPolicy(BasePolicy):
 
     @property
     def project(self) -> Projection:
-        """p of the AET loss."""
-        return self._projections(self.online, self.own_projection)
+        """p of the AET loss, and the predictor behind it."""
+        project = self._projections(self.online, self.own_projection)
+        predict = self.predictor_net
+        return project if predict is None else lambda rows: predict(project(rows))
 
     @property
     def target_project(self) -> Projection:
         """p̄, from the target copy."""
-        return self._projections(self.target, self.own_projection_target)
+        return self._projections(self.latent_target, self.own_projection_target)
 
     def _projections(self, network: EqRNetwork, own: nn.Linear | None) -> Projection:
         if own is not None:
@@ -273,17 +365,14 @@ class EqRPolicy(BasePolicy):
         return network.head.project if self.projection == "head" else nn.Identity()
 
     def update_target(self, tau: float) -> None:
-        """Move the one target copy (encoder, Q head, κ, b) by ``tau`` in [0, 1]; 1 copies."""
-        online, target, online_statistics, target_statistics = self._target_tensors
-        self.target_is_copy = tau == 1
-        with th.no_grad():
-            if tau < 1:
-                th._foreach_mul_(target, 1 - tau)
-                th._foreach_add_(target, online, alpha=tau)
-                target, online = [], []
-            target, online = target + target_statistics, online + online_statistics
-            if target:  # statistics are copied in any case, see https://github.com/DLR-RM/stable-baselines3/issues/996
-                th._foreach_copy_(target, online)
+        """Move the target (encoder and Q head, and the latent model's unless it has a ``latent_tau``); 1 copies."""
+        self.target_copy.update(tau)
+
+    def after_gradient_step(self) -> None:
+        """The online networks have changed: targets that are copies are none any more, and the latent model's moves."""
+        self.target_copy.is_exact = self.latent_target_copy.is_exact = False
+        if self.latent_tau is not None:
+            self.latent_target_copy.update(self.latent_tau)
 
     def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """
@@ -300,6 +389,7 @@ class EqRPolicy(BasePolicy):
             (self.latent_model, fresh.latent_model, shrink_factor),
             (self.online.head, fresh.online.head, 0.0),
             (self.own_projection, fresh.own_projection, 0.0),
+            (self.predictor_net, fresh.predictor_net, 0.0),
         ]
         with th.no_grad():
             for old, new, alpha in parts:
@@ -309,29 +399,13 @@ class EqRPolicy(BasePolicy):
                     if parameter.requires_grad:
                         parameter.copy_(alpha * parameter + (1 - alpha) * drawn if alpha > 0 else drawn)
         self.optimizer.state.clear()
-        self.update_target(1.0)
-
-    @cached_property
-    def _target_tensors(self) -> tuple[list[th.Tensor], ...]:
-        """Parameters of the online parts, of their target copies, running statistics of both."""
-        parts = list(zip(*self._target_pairs(), strict=True))
-        parameters = [[p for module in side for p in module.parameters()] for side in parts]
-        # The buffers themselves: tensors of a state dict would share their memory until the policy is pickled.
-        statistics = [[b for module in side for n, b in module.named_buffers() if "running_" in n] for side in parts]
-        return (*parameters, *statistics)
+        for copy in (self.target_copy, self.latent_target_copy):
+            copy.update(1.0)
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> "EqRPolicy":
-        self.__dict__.pop("_target_tensors", None)  # moved to another device, buffers are other tensors
+        for copy in (self.target_copy, self.latent_target_copy):
+            copy.forget_tensors()
         return super()._apply(fn, recurse)
-
-    def _target_pairs(self) -> list[tuple[nn.Module, nn.Module]]:
-        pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
-            (self.online, self.target),
-            (self.own_projection, self.own_projection_target),
-            (self.latent_model.transition, self.latent_model_target.transition),
-            (self.latent_model.projection, self.latent_model_target.projection),
-        ]
-        return [(online, target) for online, target in pairs if online is not None and target is not None]
 
     def set_training_mode(self, mode: bool) -> None:
         """Put everything that is trained into train or eval mode; the target copy stays in eval mode."""
@@ -354,29 +428,22 @@ class EqRPolicy(BasePolicy):
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in OWN_ARGUMENTS}}
 
 
-def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
-    """A class, or by its name in ``torch.optim``; raises ValueError for an unknown name."""
-    if not isinstance(optimizer, str):
-        return optimizer
-    found = getattr(th.optim, optimizer, None)
-    if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
-        raise ValueError(f"optimizer_class: expected a class or a name in torch.optim such as 'AdamW', found {optimizer!r}")
-    return found
-
-
-def _decay_matrices_only(policy: EqRPolicy) -> None:
-    """Biases, batch-norm parameters and the noise of noisy layers, which would die out, are spared."""
-    noise = {id(module.weight_sigma) for module in policy.modules() if isinstance(module, NoisyLinear)}
-    for group in list(policy.optimizer.param_groups):
-        if group.get("weight_decay"):
-            spared = [p for p in group["params"] if p.ndim < 2 or id(p) in noise]
-            group["params"] = [p for p in group["params"] if p.ndim >= 2 and id(p) not in noise]
-            policy.optimizer.add_param_group({**group, "params": spared, "weight_decay": 0.0})
+def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
+    """(C, H, W) of the features that a convolutional transition moves; raises ValueError if they are no map."""
+    trunk = encoder.trunk if isinstance(encoder, NormalizedExtractor) else encoder
+    if not isinstance(trunk, ImageExtractor) or trunk.linear is not None:
+        raise ValueError(
+            f'transition: "convolutional" expected an image trunk without a linear layer, found {type(trunk).__name__}. '
+            'Pass features_extractor_class="nature" or "impala" without features_dim.'
+        )
+    return trunk.map_shape
 
 
 def _frozen_copy(module: Module) -> Module:
     """A copy in eval mode without trained parameters. Parts that no target needs (r_ψ, ρ) are left out."""
     copy = deepcopy(module)
     if isinstance(copy, LatentModel):
-        del copy.reward_net, copy.action_symmetry
+        del copy.reward_net
+        if isinstance(copy, GroupLatentModel):
+            del copy.action_symmetry
     return copy.requires_grad_(False).eval()

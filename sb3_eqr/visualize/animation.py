@@ -18,7 +18,7 @@ from sb3_eqr.common.save_util import atomic_write, get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
-from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode
+from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode, group_model
 from sb3_eqr.visualize.loading import action_names
 from sb3_eqr.visualize.pixels import observed_pictures
 from sb3_eqr.visualize.sketches import panels
@@ -165,7 +165,7 @@ def describe(model: EqRAlgorithm, n_shown: int) -> str:
     :param n_shown: how many panels there are
     :return: what the agent is, in one line
     """
-    group, n_blocks = model.policy.latent_model.group, model.policy.latent_model.n_blocks
+    group, n_blocks = group_model(model).group, group_model(model).n_blocks
     blocks = "no group" if isinstance(group, NoGroup) else f"{group}" if n_blocks == 1 else f"{n_blocks} blocks of {group}"
     blocks = blocks if len(blocks) < MAX_LETTERS else f"{blocks[:MAX_LETTERS]}..."
     return f"{type(model).__name__}, {blocks}{f', the first {MAX_PANELS}' if n_shown == MAX_PANELS else ''}"

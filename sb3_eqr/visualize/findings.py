@@ -11,7 +11,7 @@ from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import measures
-from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, split
+from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, group_model, split
 
 DORMANT = 0.025  # Sokar et al. 2023, https://arxiv.org/abs/2302.12902
 
@@ -72,7 +72,7 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
     :param states: (n, D)
     :param elements: κ of every action there, (n, A, D)
     """
-    latent_model = model.policy.latent_model
+    latent_model = group_model(model)
     n_actions = latent_model.n_actions
     before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
     moved = latent_model.act(latent_model.blocks(elements.flatten(0, 1)), before)
@@ -133,7 +133,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
 
     :param rng: draws each state's partner
     """
-    latent_model = model.policy.latent_model
+    latent_model = group_model(model)
     group, n = latent_model.group, len(data.states)
     if not group.has_inverse or n < 2:
         return None

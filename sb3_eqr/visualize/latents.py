@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
+from sb3_eqr.common.latent_model import GroupLatentModel
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -135,6 +136,18 @@ def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> P
     return Play(buffer.windows(starts, envs, model.get_vec_normalize_env()), None)
 
 
+def group_model(model: EqRAlgorithm) -> GroupLatentModel:
+    """
+    The agent's latent model.
+
+    :raises ValueError: if it is not one of groups
+    """
+    found = model.policy.latent_model
+    if not isinstance(found, GroupLatentModel):
+        raise ValueError(f"expected an agent whose latent model moves states by group elements, found {type(found).__name__}")
+    return found
+
+
 def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """
     x = τ(s), by the online encoder in eval mode.
@@ -150,7 +163,7 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     with th.no_grad(), eval_mode(model):
         for start in range(0, n, CHUNK):
             piece = _map(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
-            pieces.append(model.policy.online.features(piece))
+            pieces.append(model.policy.online.features(piece)[:, : model.policy.state_dim])
     return th.cat(pieces)
 
 
@@ -190,7 +203,7 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     :param states: (N, D)
     :return: flat, as states are, (N, A, D), without gradient
     """
-    latent_model = model.policy.latent_model
+    latent_model = group_model(model)
     n, n_actions = len(states), latent_model.n_actions
     actions = th.arange(n_actions, device=states.device).repeat(n)  # (N * A,)
     with th.no_grad(), eval_mode(model):
@@ -203,7 +216,7 @@ def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
     :param states: or actions' elements, (..., D)
     :return: the blocks, one entry per group: a product's factors one by one
     """
-    latent_model = model.policy.latent_model
+    latent_model = group_model(model)
     group = latent_model.group
     elements = states.unflatten(-1, (latent_model.n_blocks, *group.element_shape))
     if not isinstance(group, ProductGroup):

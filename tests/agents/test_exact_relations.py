@@ -114,6 +114,7 @@ def test_sharing_the_target_pass_changes_no_number(monkeypatch):
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
         assert model.policy.target_encodes_as_online
         monkeypatch.setattr(EqRPolicy, "target_encodes_as_online", shortcut)
+        monkeypatch.setattr(EqRPolicy, "latent_target_encodes_as_online", shortcut)
         models.append(model.learn(70))
         monkeypatch.undo()
     assert same_state(*models)

@@ -237,7 +237,7 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
             kinds["perturbed"] += 1
     assert min(kinds.values()) > 0
     assert len(model.policy.optimizer.state) == 0
-    for online_part, target_part in model.policy._target_pairs():  # the target follows
+    for online_part, target_part in model.policy.target_copy.pairs:  # the target follows
         for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
             assert th.equal(a, b)
     before = {name: p.clone() for name, p in new.items()}

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.latent_model import LatentModel
+from sb3_eqr.common.latent_model import GroupLatentModel
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import coordinates, encode, split
 from tests.models import EITHER
@@ -113,7 +113,7 @@ def test_weight_of_the_td_loss(make):
 
 
 def test_actions_that_do_not_depend_on_the_state():
-    model = LatentModel(make_group("SE(2)", "gram-schmidt"), 3, 4, state_dependent_actions=False)
+    model = GroupLatentModel(make_group("SE(2)", "gram-schmidt"), 3, 4, state_dependent_actions=False)
     states, actions = th.randn(5, 18), th.tensor([0, 1, 2, 3, 0])
     elements = model.action_element(states, actions)
     assert th.equal(elements[0], elements[4]) and not th.equal(elements[0], elements[1])

@@ -128,7 +128,7 @@ def test_defaults_are_those_of_table_5(make):
     buffer = model.replay_buffer
     assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.4, 1.0)
     assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
-    assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (1, 1, 1)
+    assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (5, 1, 5)  # means over M = 5 steps
     assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
     adam = model.policy.optimizer.defaults
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
@@ -321,19 +321,19 @@ def test_train_mode_reaches_all_that_is_trained_and_nothing_else(make):
 
 def test_the_one_target_copy_follows(make):
     model = make(ChainEnv()).learn(80)
-    pairs = model.policy._target_pairs()
+    pairs = model.policy.target_copy.pairs
     assert len(pairs) == 3  # encoder with Q head, κ, b
     for online, target in pairs:
         for a, b in zip(online.state_dict().values(), target.state_dict().values(), strict=True):
             assert th.equal(a, b) or a.dtype == th.int64  # num_batches_tracked is not used by inference
     slow = make(ChainEnv(), tau=0.5)
-    before = [p.clone() for _, target in slow.policy._target_pairs() for p in target.parameters()]
+    before = [p.clone() for _, target in slow.policy.target_copy.pairs for p in target.parameters()]
     with th.no_grad():
-        for online, _ in slow.policy._target_pairs():
+        for online, _ in slow.policy.target_copy.pairs:
             for p in online.parameters():
                 p.add_(1.0)
     slow.policy.update_target(0.5)
-    after = [p for _, target in slow.policy._target_pairs() for p in target.parameters()]
+    after = [p for _, target in slow.policy.target_copy.pairs for p in target.parameters()]
     for a, b in zip(before, after, strict=True):
         th.testing.assert_close(b, a + 0.5)
 

@@ -49,6 +49,10 @@ PROMISES: dict[str, dict[str, Promise]] = {
             ),
             text=("`Objective.__call__`", "`reward_coef`", "`aet_coef`", "`symmetry_coef`", "`td_coef`", "$w_i$"),
         ),
+        "sb3_eqr/common/gradients.py, _Branch.backward": Promise(
+            code=("th.mm(both, both.mT, out=ctx.gram)", "ctx.share * ", "th.addcmul(of_td, auxiliary, scale)"),
+            text=("`branch`", "`aux_gradient_share=0.3`", "`train/td_state_gradient`"),
+        ),
         "sb3_eqr/common/rollout.py, _Rollout.forward": Promise(
             code=("th.addmm(offset, states[-1], transposed)", "group.act_vjp(params.view(", "th.stack(states[1:], dim=1)"),
             text=("`rollout` in `sb3_eqr/common/rollout.py`", r"= \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}"),
@@ -69,9 +73,9 @@ PROMISES: dict[str, dict[str, Promise]] = {
             code=("cosines / TEMPERATURE", "F.cross_entropy(logits"),
             text=("`contrastive_loss`", '`policy_kwargs=dict(aet_loss="contrastive")`', r"\sum_{j=1}^{B} \exp"),
         ),
-        "sb3_eqr/common/latent_model.py, LatentModel._symmetry_loss": Promise(
+        "sb3_eqr/common/latent_model.py, GroupLatentModel.symmetry_loss": Promise(
             code=("self.group.compose(self.blocks(partner), self.group.inverse(", "self.action_symmetry(", "th.no_grad()"),
-            text=("`LatentModel._symmetry_loss`", "`symmetry_coef`", r"\tau_g = \bar x^{(j)}_0 \, x_0^{-1}"),
+            text=("`GroupLatentModel.symmetry_loss`", "`symmetry_coef`", r"\tau_g = \bar x^{(j)}_0 \, x_0^{-1}"),
         ),
         "sb3_eqr/common/losses.py, reward_mse": Promise(
             code=("F.mse_loss(prediction.squeeze(-1), reward",),

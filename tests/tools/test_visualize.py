@@ -83,7 +83,7 @@ def look(model, n_steps=300, **kwargs):
 @pytest.fixture(scope="module")
 def trained():
     """The losses of the latent model alone, a large learning rate and a fast target: it predicts after 80 updates."""
-    return make_model(td_coef=0, learning_rate=1e-2, learning_starts=40, tau=0.2).learn(120)
+    return make_model(td_coef=0, aet_coef=3.0, reward_coef=3.0, learning_rate=1e-2, learning_starts=40, tau=0.2).learn(120)
 
 
 def collapse(model):

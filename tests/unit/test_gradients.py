@@ -7,7 +7,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
+from sb3_eqr.common.gradients import assign_gradients, branch, clip_grad_norm
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
 from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.networks.layers import NoisyLinear, draw_noise
@@ -139,3 +139,37 @@ def test_clipping_is_that_of_pytorch(max_norm):
     expected = nn.utils.clip_grad_norm_(parameters, float("inf") if max_norm is None else max_norm)
     assert th.equal(found, expected) and parameters[2].grad is None
     assert all(th.equal(a, p.grad) for a, p in zip(clipped, parameters, strict=False))
+
+
+@pytest.mark.parametrize("share", [None, 0.0, 0.3, 1e6])
+def test_two_gradients_meet_at_the_state(share):
+    """The encoder sees TD's gradient and as much of the auxiliary one as its share allows; by autograd, term by term."""
+    th.manual_seed(0)
+    inputs = th.randn(5, 4, dtype=th.float64)
+    encoder, gram = nn.Linear(4, 6).double(), th.zeros(2, 2, dtype=th.float64)
+
+    def td(features):
+        return features.sin().sum()
+
+    def auxiliary(state):
+        return 7 * state.square().sum()
+
+    features = encoder(inputs)
+    of_td, of_auxiliary = (
+        th.autograd.grad(f, features, retain_graph=True)[0] for f in (td(features), auxiliary(features[:, :4]))
+    )
+    ratio = (of_td.norm() / of_auxiliary.norm()).item()
+    scale = 1.0 if share is None else min(1.0, share * ratio)
+    expected = th.autograd.grad(features, encoder.weight, of_td + scale * of_auxiliary)
+    features, state = branch(encoder(inputs), 4, share, gram)
+    found = th.autograd.grad(td(features) + auxiliary(state), encoder.weight)
+    same(found, expected)
+    flat = th.stack([of_td.flatten(), of_auxiliary.flatten()])
+    th.testing.assert_close(gram, th.einsum("ik,jk->ij", flat, flat))
+
+
+def test_no_gradient_is_no_division_by_zero():
+    features = th.randn(3, 2, requires_grad=True)
+    branched, state = branch(features, 2, 0.5, th.zeros(2, 2))
+    (found,) = th.autograd.grad(branched.sum() + 0 * state.sum(), features)
+    assert th.equal(found, th.ones(3, 2))

@@ -5,15 +5,16 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.latent_model import LatentModel
+from sb3_eqr.common.latent_model import GroupLatentModel
 
 
 def identity(states):
     return states
 
 
-class KnownActions(LatentModel):
+class KnownActions(GroupLatentModel):
     """SO(2), one block, with the κ of a world where action 0 turns by +θ and action 1 by −θ, whatever the state."""
 
     def __init__(self, theta):
@@ -63,10 +64,10 @@ def test_the_true_kappa_has_no_transition_loss():
 def test_wrong_kappas_cost_what_geometry_says():
     """Two unit-normed rotation matrices that differ by the angle δ lie 2 − 2 cos δ apart."""
     losses, turns = rotation_world(0.0)  # never moves
-    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).sum(axis=1), atol=1e-12)
+    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).mean(axis=1), atol=1e-12)
     np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
     losses, turns = rotation_world(-0.7)  # moves the wrong way
-    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).sum(axis=1), atol=1e-12)
+    np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).mean(axis=1), atol=1e-12)
 
 
 def test_a_wrong_rho_costs_get_alone():
@@ -77,15 +78,16 @@ def test_a_wrong_rho_costs_get_alone():
 
 def test_reward_loss_by_hand():
     losses, _ = rotation_world(0.7)  # predicts 0.25 everywhere
-    expected = [0.75**2 + 2 * 0.25**2, 2 * 0.25**2 + 1.25**2, 0.0]
+    expected = [(0.75**2 + 2 * 0.25**2) / 3, (2 * 0.25**2 + 1.25**2) / 3, 0.0]
     np.testing.assert_allclose(losses.reward, expected, atol=1e-12)
 
 
 def test_every_loss_obeys_the_mask():
     mask = th.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 0.0]], dtype=th.float64)
     losses, turns = rotation_world(0.0, mask=mask)
-    np.testing.assert_allclose(losses.aet, ((2 - 2 * np.cos(turns)) * mask.numpy()).sum(axis=1), atol=1e-12)
-    np.testing.assert_allclose(losses.reward, [0.75**2, 2 * 0.25**2 + 1.25**2, 0.0], atol=1e-12)
+    costs = 2 - 2 * np.cos(turns)
+    np.testing.assert_allclose(losses.aet, [costs[0, 0], costs[1].mean(), costs[2, :2].mean()], atol=1e-12)
+    np.testing.assert_allclose(losses.reward, [0.75**2, (2 * 0.25**2 + 1.25**2) / 3, 0.0], atol=1e-12)
     losses, _ = rotation_world(0.0, mask=th.zeros(3, 3, dtype=th.float64))
     assert all((loss == 0).all() for loss in losses)
 
@@ -93,8 +95,8 @@ def test_every_loss_obeys_the_mask():
 def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", batch=6, depth=4, seed=0):
     th.manual_seed(seed)
     made = make_group(group)
-    model = LatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
-    target = LatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
+    model = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
+    target = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
     target.requires_grad_(False).eval()
     params = th.randn(batch, depth + 1, n_blocks, made.num_params, dtype=th.float64)
     case = {
@@ -152,8 +154,8 @@ def test_against_loops_over_samples_and_blocks():
             truth = case["target_rollout"][i, m].numpy()
             aet += distance(run(case["project"], x), run(case["target_project"], truth))
             reward += (run(model.reward_net, x)[0] - case["rewards"][i, m].item()) ** 2
-        assert losses.aet[i].item() == pytest.approx(aet, rel=1e-10)
-        assert losses.reward[i].item() == pytest.approx(reward, rel=1e-10)
+        assert losses.aet[i].item() == pytest.approx(aet / 4, rel=1e-10)
+        assert losses.reward[i].item() == pytest.approx(reward / 4, rel=1e-10)
 
         start, partner = case["state"][i].numpy(), case["target_state"][partners[i]].numpy()
         symmetry = [p @ np.linalg.inv(s) for p, s in zip(blocks(partner), blocks(start), strict=True)]
@@ -227,7 +229,7 @@ def test_the_group_action_between_states_carries_no_gradient():
 def test_every_group_trains(group):
     made = make_group(group)
     th.manual_seed(0)
-    model = LatentModel(made, 2, 3)
+    model = GroupLatentModel(made, 2, 3)
     size = 2 * int(np.prod(made.element_shape))
     states = made.element(th.randn(8, 4, 2, made.num_params)).flatten(2)
     state = states[:, 0].clone().requires_grad_()
@@ -241,7 +243,7 @@ def test_every_group_trains(group):
 
 def test_a_singular_state_neither_stops_nor_poisons():
     made = make_group("GL(2)")
-    model = LatentModel(made, 2, 3)
+    model = GroupLatentModel(made, 2, 3)
     state = th.zeros(4, 8, requires_grad=True)
     actions, rewards, mask, targets = th.zeros(4, 2, dtype=th.int64), th.zeros(4, 2), th.ones(4, 2), th.zeros(4, 2, 8)
     losses = model(state, actions, rewards, mask, targets[:, 0], targets, model, identity, identity)
@@ -260,10 +262,50 @@ def test_what_is_absent_is_off():
             found = getattr(losses, field)
             assert found is None if field == name else th.equal(found, getattr(full, field))
     with pytest.raises(ValueError, match=r"\['mse', 'categorical'\]"):
-        LatentModel(make_group("SE(2)"), 2, 3, reward_loss="huber")
+        GroupLatentModel(make_group("SE(2)"), 2, 3, reward_loss="huber")
 
 
 def test_without_a_group_the_network_predicts_the_next_state():
-    free = LatentModel(make_group("none(6)"), 1, 3).eval()
+    free = GroupLatentModel(make_group("none(6)"), 1, 3).eval()
     expected = free.transition(th.cat([th.ones(3, 6), th.eye(3)], dim=1))
     th.testing.assert_close(free.rollout(th.ones(3, 6), th.arange(3)[:, None])[:, 0], expected)
+
+
+def test_convolutional_transition_by_hand():
+    """One action, one channel, all kernels the identity: s, a become ReLU(s + a-plane), scaled to [0, 1]."""
+    model = ConvLatentModel((1, 2, 3), n_actions=2).double().eval()
+    first, _, norm, second, _ = model.transition
+    for layer in (first, second):
+        nn.init.zeros_(layer.weight), nn.init.zeros_(layer.bias)
+    with th.no_grad():
+        first.weight[0, :, 1, 1] = th.tensor([1.0, -2.0, 3.0])  # the state, action 0, action 1
+        second.weight[0, 0, 1, 1] = 1.0
+        norm.running_var.fill_(1.0 - norm.eps)
+    state = th.tensor([[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]], dtype=th.float64)
+    found = model.rollout(state, th.tensor([[0, 1]]))
+    once = th.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0], dtype=th.float64) / 3  # ReLU(s - 2)
+    th.testing.assert_close(found[0, 0], once, atol=1e-5, rtol=0)
+    th.testing.assert_close(found[0, 1], once, atol=1e-5, rtol=0)  # s + 3, scaled to [0, 1] again
+
+
+def test_convolutional_transition_learns_to_turn_a_picture():
+    """A latent model that predicts: the state is the picture itself, actions shift it by a column."""
+    th.manual_seed(0)
+    model = ConvLatentModel((1, 4, 4), n_actions=2)
+    optimizer = th.optim.Adam(model.transition.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(150):
+        picture = th.rand(64, 4, 4)
+        actions = th.randint(2, (64, 2))
+        shifts = (2 * actions - 1).cumsum(dim=1)
+        rolled = [th.stack([p.roll(int(n), dims=1) for p, n in zip(picture, shift, strict=True)]) for shift in shifts.T]
+        truth = th.stack(rolled, dim=1).flatten(2)
+        identity = nn.Identity()
+        mask = th.ones(64, 2)
+        found = model(picture.flatten(1), actions, None, mask, picture.flatten(1), truth, None, identity, identity)
+        loss = found.aet.mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])

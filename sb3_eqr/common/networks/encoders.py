@@ -128,7 +128,7 @@ class ImageExtractor(BaseFeaturesExtractor):
     def __init__(
         self,
         observation_space: spaces.Box,
-        make_trunk: Callable[[int], nn.Module],
+        make_trunk: Callable[[int], ConvTrunk],
         smallest: int,
         features_dim: int | None,
         normalized_image: bool,
@@ -150,7 +150,9 @@ class ImageExtractor(BaseFeaturesExtractor):
             )
         trunk = make_trunk(channels)
         with th.no_grad():
-            trunk_dim = trunk(th.zeros(1, channels, height, width)).shape[1]
+            image = th.zeros(1, channels, height, width)
+            _, *self.map_shape = nn.Sequential(*list(trunk)[:-1])(image).shape  # (C, H, W), before they are flat
+            trunk_dim = prod(self.map_shape)
         super().__init__(observation_space, features_dim or trunk_dim)
         self.trunk = trunk
         self.rescale = rescale
@@ -223,6 +225,24 @@ def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> ty
     return ConvExtractor if is_image else FlattenExtractor
 
 
+class NormalizedExtractor(BaseFeaturesExtractor):
+    """
+    A trunk and layer norm behind it (Ba et al. 2016, https://arxiv.org/abs/1607.06450): the features of each sample have mean
+    0 and variance 1, so that what differs between samples is as large as the layers behind it expect.
+
+    :param trunk: any features extractor
+    """
+
+    def __init__(self, trunk: BaseFeaturesExtractor):
+        super().__init__(trunk._observation_space, trunk.features_dim)
+        self.trunk = trunk
+        self.norm = nn.LayerNorm(trunk.features_dim)
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        """What the trunk takes, to features, (B, features_dim)."""
+        return self.norm(self.trunk(observations))
+
+
 class GroupFeaturesExtractor(BaseFeaturesExtractor):
     """
     A trunk, one linear layer to the Lie algebra, K group elements, flattened (τ_θ of Eq. 13, appendix B.4).
@@ -235,6 +255,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether the algebra parameters are whitened over the batch
         (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are driven apart
+    :param layer_norm: whether layer norm stands behind the trunk
+    :param skip_connection: whether the trunk's features follow the elements: a head behind them sees both
     :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
@@ -250,6 +272,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         n_blocks: int | None = None,
         parameterization: str = "euler",
         whiten: bool = False,
+        layer_norm: bool = False,
+        skip_connection: bool = False,
         trunk_class: str | type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
         normalized_image: bool = False,
@@ -261,6 +285,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
             n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
         check_number("n_blocks", n_blocks, 1, whole=True)
         super().__init__(observation_space, n_blocks * prod(made.element_shape))
+        self.state_dim = self.features_dim  # D: of the elements alone
         self.group = made
         self.n_blocks = n_blocks
         self.description = f"{made}^{n_blocks}, {parameterization}"  # shapes of parameters do not determine the group
@@ -271,14 +296,22 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
             trunk_kwargs.setdefault("normalized_image", normalized_image)
         if features_dim is not None:
             trunk_kwargs["features_dim"] = features_dim
-        self.trunk = found(observation_space, **trunk_kwargs)
+        trunk = found(observation_space, **trunk_kwargs)
+        self.trunk: BaseFeaturesExtractor = NormalizedExtractor(trunk) if layer_norm else trunk
+        self.skip_connection = skip_connection
+        if skip_connection:
+            self._features_dim += trunk.features_dim
         n_params = n_blocks * made.num_params
         self.to_algebra: nn.Module = nn.Linear(self.trunk.features_dim, n_params)
         if whiten:
             self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, features_dim)."""
-        params = self.to_algebra(self.trunk(observations))  # (B, K * num_params)
-        elements = self.group.element(params.view(-1, self.n_blocks, self.group.num_params))
-        return elements.flatten(1)  # (B, K * prod(element_shape))
+        """
+        Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, D), and behind them, with a
+        skip connection, the trunk's features: (B, features_dim).
+        """
+        features = self.trunk(observations)
+        params = self.to_algebra(features)  # (B, K * num_params)
+        elements = self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
+        return th.cat([elements, features], dim=1) if self.skip_connection else elements

@@ -158,6 +158,7 @@ class DistributionalHead(nn.Module):
         streams = [MLP([*(net_arch or [features_dim]), size], activation_fn, sigma_init) for size in sizes]
         self.advantage, self.value = streams[0], streams[1] if dueling else None
         self.activation = activation_fn()
+        self.projection_dim = sum(widths)  # P of :meth:`project`
         modules = [self.first, *streams]
         self._noisy_layers = [layer for module in modules for layer in module if isinstance(layer, NoisyLinear)]
 

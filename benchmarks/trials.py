@@ -1,0 +1,159 @@
+"""
+Trials of settings on small games: what differs from an entry of ``zoo_hyperparams``, by name, over games and seeds; a row of
+one file for each run, so that no number is lost and none is run twice.
+
+    python -m benchmarks.trials benchmarks/trials/rainbow.yml --rows docs/results/trials.jsonl --seeds 0 1 2 3 4 --jobs 2
+    python -m benchmarks.trials benchmarks/trials/rainbow.yml --rows docs/results/trials.jsonl --table
+
+A file of trials names each trial's agent (a file of ``zoo_hyperparams``: eqr_rainbow, stock/qrdqn, ...) and its changes:
+
+    no_noise: {agent: eqr_rainbow, changes: {exploration_final_eps: 0.01, policy_kwargs: {noisy: false}}}
+"""
+
+import argparse
+import importlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import yaml
+
+GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are for the final comparison alone
+N_PARTS = 10  # of a learning curve
+
+
+def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, Any]:
+    """
+    One run, from the first step to 100 episodes of the greedy policy.
+
+    :param trial: agent, changes
+    :return: what goes into its row
+    """
+    import torch as th
+    from sb3_contrib import QRDQN
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.logger import KVWriter, Logger
+
+    from sb3_eqr import EqRQRDQN, EqRRainbow, envs
+    from sb3_eqr.benchmark.evaluation import evaluate
+    from sb3_eqr.benchmark.suites import choose, load_suite
+    from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+
+    class Means(KVWriter):
+        """Keeps what is logged, to take its mean."""
+
+        def __init__(self) -> None:
+            self.values: dict[str, list[float]] = defaultdict(list)
+
+        def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+            for key, value in key_values.items():
+                if isinstance(value, (int, float, np.floating)):
+                    self.values[key].append(float(value))
+
+        def close(self) -> None: ...
+
+    th.set_num_threads(1)
+    envs.register()
+    suite = choose(load_suite("minatar"), [game], steps)
+    protocol = suite.protocol(game)
+    agent = trial["agent"]
+    kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN}
+    changes = {"buffer_size": steps, **trial.get("changes", {})}
+    entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[protocol["env_id"]]
+    arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, changes)
+    env = make_vec_env(protocol["env_id"], seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
+    model: Any = kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **arguments)
+    means = Means()
+    model.set_logger(Logger(folder=None, output_formats=[means]))
+    started = time.monotonic()
+    model.learn(steps, log_interval=20)
+    seconds = time.monotonic() - started
+    scores, _ = evaluate(model, protocol, 100, seed)
+    curve = [float(np.mean(part)) for part in np.array_split(means.values["rollout/ep_rew_mean"], N_PARTS) if len(part)]
+    logged = {key: float(np.median(values)) for key, values in means.values.items() if key.startswith("train/")}
+    return {
+        "score": float(np.mean(scores)),
+        "seconds": round(seconds, 1),
+        "curve": [round(value, 3) for value in curve],
+        "train": {key.removeprefix("train/"): float(f"{value:.4g}") for key, value in logged.items()},
+    }
+
+
+def merged(entry: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """An entry with changes, those of dictionaries merged; what RL Zoo evaluates is evaluated."""
+    result = {**entry, **changes}
+    for key, old in entry.items():
+        if isinstance(old, str) and old.startswith("dict("):
+            old = eval(old, {"importlib": importlib})
+        if isinstance(old, dict):
+            result[key] = merged(old, changes.get(key, {}))
+    return result
+
+
+def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
+    """All rows of a file, none if there is no such file."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+
+
+def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
+    """Markdown: mean ± standard error and seeds of each trial on each game, and minutes a run."""
+    lines = [f"| trial, {steps:,} steps | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 2) + "|"]
+    for name in names:
+        own = [row for row in rows if row["trial"] == name and row["steps"] == steps]
+        cells = []
+        for game in games:
+            scores = [row["score"] for row in own if row["game"] == game]
+            error = np.std(scores, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else np.nan
+            cells.append(f"{np.mean(scores):.2f} ± {error:.2f} ({len(scores)})" if scores else "")
+        if own:
+            lines.append(f"| {name} | " + " | ".join(cells) + f" | {np.median([row['seconds'] for row in own]):.0f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trials", type=pathlib.Path, help="YAML file")
+    parser.add_argument("--rows", type=pathlib.Path, required=True, help="JSON lines, read and appended to")
+    parser.add_argument("--names", nargs="+", help="of trials; all in the file where not given")
+    parser.add_argument("--games", nargs="+", default=list(GAMES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once, one thread each")
+    parser.add_argument("--table", action="store_true", help="print what there is, run nothing")
+    parser.add_argument("--one", nargs=3, metavar=("NAME", "GAME", "SEED"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    trials = yaml.safe_load(arguments.trials.read_text(encoding="utf-8"))
+    names = arguments.names or list(trials)
+    if arguments.one:
+        name, game, seed = arguments.one
+        row = {"trial": name, "game": game, "seed": int(seed), "steps": arguments.steps, **trials[name]}
+        row |= run(trials[name], game, int(seed), arguments.steps)
+        with open(arguments.rows, "a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        return
+    if not arguments.table:
+        done = {(r["trial"], r["game"], r["seed"], r["steps"]) for r in read_rows(arguments.rows)}
+        wanted = [(name, game, seed) for seed in arguments.seeds for name in names for game in arguments.games]
+        left = [key for key in wanted if (*key, arguments.steps) not in done]
+        command = [sys.executable, "-m", "benchmarks.trials", str(arguments.trials), "--rows", str(arguments.rows)]
+        command += ["--steps", str(arguments.steps), "--one"]
+
+        def start(key: tuple[str, str, int]) -> None:
+            subprocess.run([*command, *map(str, key)], check=False, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            list(pool.map(start, left))
+    print(table(read_rows(arguments.rows), names, arguments.games, arguments.steps))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""Which optimiser, and what it is given."""
+
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_eqr.common.networks.layers import NoisyLinear
+
+ADAM_EPS = 1.5e-4  # Table 5
+
+
+def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
+    """A class, or by its name in ``torch.optim``; raises ValueError for an unknown name."""
+    if not isinstance(optimizer, str):
+        return optimizer
+    found = getattr(th.optim, optimizer, None)
+    if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
+        raise ValueError(f"optimizer_class: expected a class or a name in torch.optim such as 'AdamW', found {optimizer!r}")
+    return found
+
+
+def set_adam_defaults(policy_kwargs: dict[str, Any], device: th.device) -> None:
+    """
+    Fill in what is not given: Adam, and for Adam and AdamW the epsilon of Table 5 and one kernel for all parameters, where
+    PyTorch's default has six for each.
+
+    :param policy_kwargs: of an agent, changed in place
+    :param device: of the agent
+    """
+    policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
+    if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
+        given = policy_kwargs.get("optimizer_kwargs") or {}
+        fused = device.type in ("cpu", "cuda") and not (given.get("foreach") or given.get("differentiable"))
+        policy_kwargs["optimizer_kwargs"] = {"eps": ADAM_EPS, "fused": fused, **given}
+
+
+def decay_matrices_only(model: nn.Module, optimizer: th.optim.Optimizer) -> None:
+    """Biases, batch-norm parameters and the noise of noisy layers, which would die out, are spared."""
+    noise = {id(module.weight_sigma) for module in model.modules() if isinstance(module, NoisyLinear)}
+    for group in list(optimizer.param_groups):
+        if group.get("weight_decay"):
+            spared = [p for p in group["params"] if p.ndim < 2 or id(p) in noise]
+            group["params"] = [p for p in group["params"] if p.ndim >= 2 and id(p) not in noise]
+            optimizer.add_param_group({**group, "params": spared, "weight_decay": 0.0})

@@ -1,0 +1,147 @@
+"""What enters the latent model, and the gradients that meet at the state."""
+
+import numpy as np
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.common.objective import LossCoefs
+from tests.toys import ChainEnv, ImageEnv
+
+SETTINGS = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "n_steps": 2, "prediction_depth": 3, "seed": 0}
+SKIP = {"skip_connection": True, "projection": "own", "layer_norm": True, "n_blocks": 4, "net_arch": [16]}
+
+
+def trained(kind=EqRRainbow, env=None, **changes):
+    return kind("MlpPolicy", env or ChainEnv(), **{**SETTINGS, **changes}).learn(60)
+
+
+def test_layer_norm_gives_each_sample_mean_0_and_variance_1():
+    for group in ("SE(2)", None):
+        model = EqRQRDQN(
+            "CnnPolicy", ImageEnv(), **{**SETTINGS, "symmetry_coef": 0.0}, policy_kwargs={"layer_norm": True, "group": group}
+        )
+        encoder = model.policy.online.features_extractor
+        trunk = encoder if group is None else encoder.trunk
+        features = trunk(th.rand(5, 1, 36, 36)).detach().numpy()
+        np.testing.assert_allclose(features.mean(axis=1), 0, atol=1e-6)
+        np.testing.assert_allclose(features.std(axis=1), 1, atol=2e-2)  # ε of the norm
+
+
+def test_the_head_sees_the_trunk_beside_the_state():
+    model = trained(policy_kwargs=SKIP)
+    policy, encoder = model.policy, model.policy.online.features_extractor
+    inputs = th.rand(5, 3)
+    features, trunk = encoder(inputs), encoder.trunk(inputs)
+    elements = encoder.group.element(encoder.to_algebra(trunk).view(5, 4, 3)).flatten(1)
+    assert th.equal(features, th.cat([elements, trunk], dim=1))
+    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == 4 * 6 + 3
+
+
+def test_a_skip_connection_needs_a_group_and_a_projection_of_its_own():
+    with pytest.raises(ValueError, match=r"expected a group.*found group=None"):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True, "group": None})
+    with pytest.raises(ValueError, match=r'projection: expected one that takes the state alone.*found "head"'):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True})
+
+
+@pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
+@pytest.mark.parametrize("share", [None, 0.05])
+def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share):
+    """From the losses one by one: each alone gives its gradient at the state and at the encoder's weights."""
+    settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the one loss that draws partners
+    model = trained(kind, **settings, policy_kwargs={"layer_norm": True, "projection": "own", "noisy": False})
+    policy, samples = model.policy, model.replay_buffer.sample(8)
+    weight = policy.online.features_extractor.to_algebra.weight
+    states = []
+    policy.online.features_extractor.register_forward_hook(
+        lambda module, args, out: states.append(out) if out.requires_grad else None
+    )
+
+    def gradients(td, aet, reward):
+        states.clear()
+        terms = model.objective(samples, LossCoefs(td, aet, 0.0, reward))
+        return (*th.autograd.grad(terms.loss, [states[0], weight], retain_graph=True), terms)
+
+    of_td, td_weight, _ = gradients(1.0, 0.0, 0.0)
+    of_auxiliary, auxiliary_weight, _ = gradients(0.0, 1.0, 1.0)
+    ratio = (of_td.norm() / of_auxiliary.norm()).item()
+    scale = 1.0 if share is None else min(1.0, share * ratio)
+    assert share is None or scale < 1  # or the test says nothing
+    _, found, terms = gradients(1.0, 1.0, 1.0)
+    th.testing.assert_close(found, td_weight + scale * auxiliary_weight, rtol=1e-4, atol=1e-7)
+    metrics = terms.metrics()
+    assert metrics["td_state_gradient"].item() == pytest.approx(of_td.norm().item(), rel=1e-4)
+    assert metrics["aux_state_gradient"].item() == pytest.approx(of_auxiliary.norm().item(), rel=1e-4)
+    cosine = nn.functional.cosine_similarity(of_td.flatten(), of_auxiliary.flatten(), dim=0).item()
+    assert metrics["state_gradient_cosine"].item() == pytest.approx(cosine, abs=1e-4)
+
+
+def test_the_gradients_are_logged():
+    model = trained()
+    model._log_last_round()
+    assert {"train/td_state_gradient", "train/aux_state_gradient", "train/state_gradient_cosine"} <= set(
+        model.logger.name_to_value
+    )
+
+
+@pytest.mark.parametrize("latent_tau", [1.0, 0.25])
+def test_the_latent_target_moves_by_itself(latent_tau):
+    model = trained(policy_kwargs={"latent_tau": latent_tau}, target_update_interval=1_000)
+    policy = model.policy
+    q_target = [p.clone() for p in policy.target.parameters()]
+    latent = [(p.clone(), q) for q, p in zip(policy.online.parameters(), policy.latent_target.parameters(), strict=True)]
+    with th.no_grad():
+        for p in policy.online.parameters():
+            p.add_(1.0)
+    policy.after_gradient_step()
+    assert all(th.equal(a, b) for a, b in zip(q_target, policy.target.parameters(), strict=True))
+    for (before, online), after in zip(latent, policy.latent_target.parameters(), strict=True):
+        th.testing.assert_close(after, before + latent_tau * (online - before))
+
+
+def test_a_copied_latent_target_is_the_online_encoder(monkeypatch):
+    """With latent_tau=1 one pass of the online encoder gives x̄₀, too: a shortcut, not another algorithm."""
+    states = []
+    for shortcut in (True, False):
+        if not shortcut:
+            monkeypatch.setattr("sb3_eqr.common.policies.EqRPolicy.latent_target_encodes_as_online", False)
+        model = trained(policy_kwargs={"latent_tau": 1.0, "noisy": False}, target_update_interval=20)
+        states.append(model.policy.state_dict())
+    assert all(th.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+@pytest.mark.parametrize("projection", ["head", "own", "none"])
+def test_the_predictor_stands_on_the_online_side_alone(projection):
+    model = trained(policy_kwargs={"projection": projection, "predictor": True, "latent_tau": 1.0})
+    policy = model.policy
+    rows = th.randn(5, policy.state_dim)
+    same = policy._projections(policy.online, policy.own_projection)(rows)
+    assert th.equal(policy.project(rows), policy.predictor_net(same))
+    assert th.equal(policy.target_project(rows), same)  # a copy of the projection, without a predictor
+
+
+def test_spr_learns_saves_and_loads(tmp_path):
+    settings = {**SETTINGS, "aet_coef": 5.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
+    policy_kwargs = {"group": None, "transition": "convolutional", "predictor": True, "latent_tau": 1.0}
+    policy_kwargs |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]], "rescale": True}}
+    model = EqRRainbow("CnnPolicy", ImageEnv(), **settings, policy_kwargs=policy_kwargs)
+    before = [p.clone() for p in model.policy.latent_model.transition.parameters()]
+    model.learn(60)
+    assert not any(th.equal(a, b) for a, b in zip(before, model.policy.latent_model.transition.parameters(), strict=True))
+    model.save(tmp_path / "spr")
+    loaded = EqRRainbow.load(tmp_path / "spr")
+    observation = model.env.reset()
+    assert (loaded.predict(observation, deterministic=True)[0] == model.predict(observation, deterministic=True)[0]).all()
+
+
+def test_a_convolutional_transition_needs_a_map():
+    with pytest.raises(ValueError, match=r"transition: expected group=None"):
+        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional"})
+    with pytest.raises(ValueError, match=r'"convolutional" expected an image trunk.*found FlattenExtractor'):
+        EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs={"transition": "convolutional", "group": None})
+    with pytest.raises(ValueError, match=r"symmetry_coef: the GET loss needs"):
+        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional", "group": None})
+    with pytest.raises(ValueError, match=r"transition: expected one of"):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"transition": "linear"})
