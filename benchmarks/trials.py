@@ -2,8 +2,8 @@
 Trials of settings on small games: what differs from an entry of ``zoo_hyperparams``, by name, over games and seeds; a row of
 one file for each run, so that no number is lost and none is run twice.
 
-    python -m benchmarks.trials benchmarks/trials/rainbow.yml --rows docs/results/trials.jsonl --seeds 0 1 2 3 4 --jobs 2
-    python -m benchmarks.trials benchmarks/trials/rainbow.yml --rows docs/results/trials.jsonl --table
+    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --seeds 0 1 2 3 4 --jobs 2
+    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --table
 
 A file of trials names each trial's agent (a file of ``zoo_hyperparams``: eqr_rainbow, stock/qrdqn, ...) and its changes:
 
@@ -26,6 +26,10 @@ import numpy as np
 import yaml
 
 GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are for the final comparison alone
+WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # whose symmetry is known: name -> environment, its arguments
+    "torus": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25]}),  # 256 places, one is the goal
+    "pendulum": ("PixelPendulum-v0", {}),
+}
 N_PARTS = 10  # of a learning curve
 
 
@@ -40,6 +44,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_contrib import QRDQN
     from stable_baselines3 import DQN
     from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.logger import KVWriter, Logger
 
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
@@ -62,21 +67,28 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
 
     th.set_num_threads(1)
     envs.register()
-    suite = choose(load_suite("minatar"), [game], steps)
-    protocol = suite.protocol(game)
     agent = trial["agent"]
     kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN}
-    changes = {"buffer_size": steps, **trial.get("changes", {})}
-    entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[protocol["env_id"]]
-    arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, changes)
-    env = make_vec_env(protocol["env_id"], seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
+    arguments = {"buffer_size": steps, **trial.get("changes", {})}
+    if game in WORLDS:
+        env_id, env_kwargs = WORLDS[game]
+        env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
+    else:
+        protocol = choose(load_suite("minatar"), [game], steps).protocol(game)
+        env = make_vec_env(protocol["env_id"], seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
+        entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[protocol["env_id"]]
+        arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, arguments)
     model: Any = kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **arguments)
     means = Means()
     model.set_logger(Logger(folder=None, output_formats=[means]))
     started = time.monotonic()
-    model.learn(steps, log_interval=20)
+    model.learn(steps, log_interval=4 if game in WORLDS else 20)
     seconds = time.monotonic() - started
-    scores, _ = evaluate(model, protocol, 100, seed)
+    if game in WORLDS:
+        games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
+        scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
+    else:
+        scores, _ = evaluate(model, protocol, 100, seed)
     curve = [float(np.mean(part)) for part in np.array_split(means.values["rollout/ep_rew_mean"], N_PARTS) if len(part)]
     logged = {key: float(np.median(values)) for key, values in means.values.items() if key.startswith("train/")}
     return {
@@ -104,17 +116,25 @@ def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
-    """Markdown: mean ± standard error and seeds of each trial on each game, and minutes a run."""
-    lines = [f"| trial, {steps:,} steps | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 2) + "|"]
+    """
+    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the mean of the
+    last 100 episodes of training, which explore but are five times as steady.
+    """
+    lines = [f"| trial, {steps:,} steps | seeds | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 3) + "|"]
     for name in names:
         own = [row for row in rows if row["trial"] == name and row["steps"] == steps]
         cells = []
         for game in games:
-            scores = [row["score"] for row in own if row["game"] == game]
-            error = np.std(scores, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else np.nan
-            cells.append(f"{np.mean(scores):.2f} ± {error:.2f} ({len(scores)})" if scores else "")
+            found = [row for row in own if row["game"] == game]
+            scores = np.array([row["score"] for row in found])
+            error = np.std(scores, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else np.inf
+            training = np.mean([row["curve"][-1] for row in found if row["curve"]] or [np.nan])
+            cells.append(f"{scores.mean():.2f} ± {error:.2f}, {training:.2f}" if found else "")
         if own:
-            lines.append(f"| {name} | " + " | ".join(cells) + f" | {np.median([row['seconds'] for row in own]):.0f} |")
+            seeds = len({row["seed"] for row in own})
+            lines.append(
+                f"| {name} | {seeds} | " + " | ".join(cells) + f" | {np.median([row['seconds'] for row in own]):.0f} |"
+            )
     return "\n".join(lines)
 
 
@@ -124,7 +144,7 @@ def main() -> None:
     parser.add_argument("trials", type=pathlib.Path, help="YAML file")
     parser.add_argument("--rows", type=pathlib.Path, required=True, help="JSON lines, read and appended to")
     parser.add_argument("--names", nargs="+", help="of trials; all in the file where not given")
-    parser.add_argument("--games", nargs="+", default=list(GAMES))
+    parser.add_argument("--games", nargs="+", default=list(GAMES), help=f"of MinAtar, or of {', '.join(WORLDS)}")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--jobs", type=int, default=2, help="runs at once, one thread each")

@@ -97,7 +97,7 @@ class EqRAlgorithm(SafeFiles):
         _init_setup_model: bool = True,
     ):
         """
-        Default hyperparameters are those of the paper for Atari 100K (Table 5; its losses are sums over M = 5 steps, ours means).
+        Default hyperparameters are those of the paper for Atari 100K (Table 5: sums over 5 steps there, means here).
 
         :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
