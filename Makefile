@@ -15,7 +15,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: $(VENV)/installed
-	OMP_WAIT_POLICY=PASSIVE $(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
+	OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" $(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
 
 test: lint type pytest
 
