@@ -117,8 +117,8 @@ def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
 
 def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
     """
-    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the mean of the
-    last 100 episodes of training, which explore but are five times as steady.
+    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the mean
+    return of the last tenth of training.
     """
     lines = [f"| trial, {steps:,} steps | seeds | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 3) + "|"]
     for name in names:

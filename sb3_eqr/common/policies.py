@@ -81,7 +81,7 @@ class EqRPolicy(BasePolicy):
         blocks are driven apart; needs a group
     :param layer_norm: whether layer norm stands behind the trunk, with a group and without
     :param skip_connection: whether the Q head sees the trunk's features beside the state; needs a group, and
-        ``projection="own"`` for the AET loss
+        ``projection="own"`` or "none" for the AET loss
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
@@ -338,7 +338,7 @@ class EqRPolicy(BasePolicy):
             )
         if aet and self.projection == "head" and self.skip_connection:
             raise ValueError(
-                "projection: expected one that takes the state alone, as the Q head takes the trunk's features beside it; "
+                'projection: expected "own" or "none" beside skip_connection=True, whose Q head takes more than the state; '
                 'found "head". Pass policy_kwargs={"projection": "own"}, or aet_coef=0.'
             )
         if aet and self.projection == "head" and not self.net_arch:

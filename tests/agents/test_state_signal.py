@@ -42,7 +42,7 @@ def test_the_head_sees_the_trunk_beside_the_state():
 def test_a_skip_connection_needs_a_group_and_a_projection_of_its_own():
     with pytest.raises(ValueError, match=r"expected a group.*found group=None"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True, "group": None})
-    with pytest.raises(ValueError, match=r'projection: expected one that takes the state alone.*found "head"'):
+    with pytest.raises(ValueError, match=r'projection: expected "own" or "none" beside skip_connection=True.*found "head"'):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True})
 
 
