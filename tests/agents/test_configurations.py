@@ -22,6 +22,8 @@ SMALL = {"learning_starts": 140, "buffer_size": 400, "batch_size": 8, "device": 
 # name: encoder, auxiliary losses
 EXPECTED = {
     "eqr_rainbow": ("SE(2)^12", {"aet", "symmetry", "reward"}),
+    "paper": ("SE(2)^12", {"aet", "symmetry", "reward"}),
+    "released": ("SE(2)^12", {"aet", "symmetry", "reward"}),
     "mlp+aet+r": ("none(512)^1", {"aet", "reward"}),
     "t2+aet+r": ("T(2)^32", {"aet", "reward"}),
     "se2+aet+r": ("SE(2)^12", {"aet", "reward"}),
@@ -32,24 +34,48 @@ EXPECTED = {
     "rainbow": (None, set()),
     "der": (None, set()),
     "drq": (None, set()),
-    "spr": ("none(512)^1", {"aet"}),
+    "spr": (None, {"aet"}),
     "deepmdp": ("none(512)^1", {"aet", "reward"}),
     "eqr_bbf": ("SE(2)^12", {"aet", "symmetry", "reward"}),
 }
 
 
-def table():
-    """The rows of the docs: name -> arguments."""
-    text = (ROOT / "docs" / "configurations.md").read_text().split("## The knobs")[0]
-    rows = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", text, re.M)
-    return {name: eval(f"dict({arguments})") for name, arguments in rows}
+def rows(text):
+    """Of a table of the docs: name -> arguments."""
+    found = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", text, re.M)
+    return {name: eval(f"dict({arguments})") for name, arguments in found}
 
 
-def test_the_table_and_the_files_agree():
-    files = {name for name, path in configuration_files().items() if path.parent.name == "ablations"}
-    assert table().keys() == files == EXPECTED.keys() - {"eqr_rainbow"}
-    for name, arguments in table().items():
+def test_the_tables_and_the_files_agree():
+    text = (ROOT / "docs" / "configurations.md").read_text().split("## Switches")[0]
+    of_paper, of_others = map(rows, text.split("The agents of others"))
+    for name, arguments in of_paper.items():
+        assert load_configuration("paper", **arguments) == load_configuration(name), name
+    for name, arguments in of_others.items():
         assert arguments == load_configuration(name), name
+    files = {name for name, path in configuration_files().items() if path.parent.name == "ablations"}
+    assert of_paper.keys() | of_others.keys() | {"paper", "se2+aet+r+get"} == files == EXPECTED.keys() - {"eqr_rainbow"}
+    assert load_configuration("se2+aet+r+get") == load_configuration("paper")
+
+
+def test_the_papers_agent_by_table_5():
+    """The figures of Table 5 and appendix B.4, one by one, on the agent as it is built."""
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
+    model = EqRRainbow("CnnPolicy", env, **load_configuration("paper"), device="cpu")
+    assert (model.batch_size, model.learning_starts, model.gamma, model.n_steps) == (32, 2_000, 0.99, 10)
+    assert (model.train_freq.frequency, model.gradient_steps, model.max_grad_norm) == (1, 2, 10.0)
+    assert (model.learning_rate, model.policy.optimizer.param_groups[0]["eps"]) == (1e-4, 1.5e-4)
+    assert (model.shift_pixels, model.intensity_scale, model.prediction_depth) == (4, 0.05, 5)
+    assert (model.aet_coef / 5, model.symmetry_coef, model.reward_coef / 5) == (1, 1, 1)  # sums over five steps there
+    assert (model.replay_buffer.alpha, model.replay_buffer.beta) == (0.5, 0.4)
+    policy = model.policy
+    assert (policy.sigma_init, policy.n_blocks, policy.online.head.n_atoms) == (0.5, 12, 51)
+    assert policy.project == policy.online.head.project and policy.latent_target is policy.target
+    assert [layer.kernel_size[0] for layer in policy.online.features_extractor.trunk.trunk if hasattr(layer, "stride")] == [
+        8,
+        4,
+        3,
+    ]
 
 
 def test_the_full_agent_is_the_default_one():
@@ -115,7 +141,8 @@ def test_each_is_trained_as_the_table_says(name):
     assert nonzero_gradients(encoder) and nonzero_gradients(model.policy.online.head)
     assert nonzero_gradients(latent.transition) == bool(losses)
     assert nonzero_gradients(latent.reward_net) == ("reward" in losses)
-    assert nonzero_gradients(latent.action_symmetry) == nonzero_gradients(latent.projection) == ("symmetry" in losses)
+    of_symmetry = [latent.action_symmetry, latent.projection] if latent.has_symmetry_loss else []
+    assert all(nonzero_gradients(part) == ("symmetry" in losses) for part in of_symmetry)
     assert all(p.grad is None for p in [*model.policy.target.parameters(), *model.policy.latent_model_target.parameters()])
     assert all(not th.equal(before[key], p) for key, p in model.policy.online.named_parameters())
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
