@@ -140,7 +140,7 @@ class ImageExtractor(BaseFeaturesExtractor):
             raise ValueError(
                 f"image encoder: expected uint8 images (channels, height, width) in [0, 255], found {observation_space}. "
                 "Use MlpPolicy for vectors, MultiInputPolicy for dicts, both without a features_extractor_class for images, "
-                "and normalize_images=False for float images."
+                "normalize_images=False for float images, and sb3_eqr.envs.minatar.ChannelsFirstImage around MinAtar's games."
             )
         channels, height, width = observation_space.shape
         if min(height, width) < smallest:
