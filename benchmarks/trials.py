@@ -28,6 +28,7 @@ import yaml
 GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are for the final comparison alone
 WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # whose symmetry is known: name -> environment, its arguments
     "torus": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25]}),  # 256 places, one is the goal
+    "large_torus": ("SlidingBallTorus-v0", {"n_steps": 32, "goal": [0.25, 0.25], "max_episode_steps": 200}),  # 1,024 places
     "pendulum": ("PixelPendulum-v0", {}),
 }
 N_PARTS = 10  # of a learning curve

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_eqr.common import validation
+from sb3_eqr.common.arguments import ALGORITHM, POLICY, check_arguments
 from sb3_eqr.common.cuda_graph import CapturedGradients
 from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
@@ -149,6 +150,8 @@ class EqRAlgorithm(SafeFiles):
         :raises TypeError: for an argument that there is not, with the nearest one that there is
         :raises AssertionError: if the action space is not Discrete (as SB3)
         """
+        check_arguments(locals(), ALGORITHM)
+        check_arguments(policy_kwargs or {}, POLICY)
         policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
         set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]
@@ -223,20 +226,12 @@ class EqRAlgorithm(SafeFiles):
         keep_freed_memory()
 
     def _check_arguments(self) -> None:
+        self._check_values()
         name = type(self).__name__
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
         chosen, given = self.replay_buffer_class, self.replay_buffer_kwargs
         validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
-        for argument in ("td_coef", "aet_coef", "symmetry_coef", "reward_coef", "intensity_scale"):
-            validation.check_number(argument, getattr(self, argument), 0)
-        for argument, least in {"prediction_depth": 0, "shift_pixels": 0, "batch_size": 1}.items():
-            validation.check_number(argument, getattr(self, argument), least, whole=True)
-        validation.check_number("tau", self.tau, 0, 1)
-        if self.aux_gradient_share is not None:
-            validation.check_number("aux_gradient_share", self.aux_gradient_share, 0)
-        if self.target_update_interval is not None:
-            validation.check_number("target_update_interval", self.target_update_interval, 1, whole=True)
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
         noisy = self.policy_kwargs.get("noisy", True)
@@ -245,6 +240,9 @@ class EqRAlgorithm(SafeFiles):
                 "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
                 "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
             )
+
+    def _check_values(self) -> None:
+        check_arguments({**vars(self), "stats_window_size": self._stats_window_size}, ALGORITHM)
 
     @property
     def depth(self) -> int:
@@ -282,6 +280,7 @@ class EqRAlgorithm(SafeFiles):
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self._check_values()  # of attributes that were set since
         result = super()._setup_learn(*args, **kwargs)
         validation.check_finite("observation", self._last_obs, self.num_timesteps)
         return result

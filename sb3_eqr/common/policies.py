@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection
@@ -28,14 +29,12 @@ from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.optimizers import decay_matrices_only, find_optimizer
 from sb3_eqr.common.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.common.validation import check_names, check_number
+from sb3_eqr.common.validation import check_names
 
 Module = TypeVar("Module", bound=nn.Module)
 Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
-PROJECTIONS = ("head", "own", "none")
-TRANSITIONS = ("group", "convolutional")
 OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "skip_connection", "dueling", "noisy"]
 OWN_ARGUMENTS += [
     "sigma_init",
@@ -147,13 +146,13 @@ class EqRPolicy(BasePolicy):
         aet_loss: str = "distance",
         **stock_kwargs: Any,
     ):
+        given = {**locals(), **stock_kwargs}
         stock = inspect.signature(super().__init__).parameters
         if any(name not in stock for name in stock_kwargs):
             own = [inspect.signature(kind.__init__).parameters for kind in (type(self), EqRPolicy)]  # type: ignore[misc]
             names = {name for parameters in own for name in list(parameters)[4:]} - {"kwargs", "stock_kwargs"}
             check_names(f"policy_kwargs: {type(self).__name__}", stock_kwargs, sorted(names))
-        check_number("latent_hidden_dim", latent_hidden_dim, 1, whole=True)
-        check_number("sigma_init", sigma_init, 0)
+        check_arguments(given, POLICY)
         if whiten and group is None:
             raise ValueError("whiten: expected a group, whose parameters are whitened, found group=None. Pass whiten=False.")
         if skip_connection and group is None:
@@ -161,14 +160,8 @@ class EqRPolicy(BasePolicy):
                 "skip_connection: expected a group, beside whose elements the trunk's features stand, found group=None. "
                 "Pass skip_connection=False."
             )
-        if transition not in TRANSITIONS:
-            raise ValueError(f"transition: expected one of {list(TRANSITIONS)}, found {transition!r}")
         if transition == "convolutional" and group is not None:
             raise ValueError(f'transition: expected group=None, whose features "convolutional" moves, found group={group!r}')
-        if latent_tau is not None:
-            check_number("latent_tau", latent_tau, 0, 1)
-        if projection not in PROJECTIONS:
-            raise ValueError(f"projection: expected one of {list(PROJECTIONS)}, found {projection!r}")
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization

@@ -3,7 +3,8 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
-from sb3_eqr.common.validation import check_names, check_number
+from sb3_eqr.common.arguments import RESETS, check_arguments
+from sb3_eqr.common.validation import check_names
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,7 @@ class ResetSchedule:
     annealing_steps: int = 10_000
 
     def __post_init__(self) -> None:
-        for name in ("interval", "initial_n_steps", "annealing_steps"):
-            if getattr(self, name) is not None:
-                check_number(f"resets: {name}", getattr(self, name), 1, whole=True)
-        check_number("resets: shrink_factor", self.shrink_factor, 0, 1)
-        check_number("resets: end", self.end, 0, 1)
-        if self.initial_gamma is not None:
-            check_number("resets: initial_gamma", self.initial_gamma, 0, 1)
+        check_arguments(vars(self), RESETS, "resets: ")
 
     @classmethod
     def of(cls, given: "ResetSchedule | dict[str, Any] | None") -> "ResetSchedule":

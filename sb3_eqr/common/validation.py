@@ -10,6 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_eqr.common.arguments import check, integer, number
+
 P = ParamSpec("P")
 
 
@@ -22,12 +24,7 @@ def check_number(name: str, value: Any, low: float, high: float = np.inf, whole:
     :param whole: whether it must be an integer
     :raises ValueError: if it is no finite number in that range
     """
-    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
-    if not isinstance(value, kinds) or not (np.isfinite(value) and low <= value <= high):
-        kind = "a whole number" if whole else "a finite number"
-        legal = f" of at least {low}" if high == np.inf else f" in [{low}, {high}]"
-        legal = "" if (low, high) == (-np.inf, np.inf) else legal
-        raise ValueError(f"{name}: expected {kind}{legal}, found {value!r}")
+    check(name, value, integer(low, high) if whole else number(low, high))
 
 
 def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:

@@ -8,11 +8,11 @@ from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import quantile_huber_loss
 from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.validation import check_number
 
 
 class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
@@ -65,7 +65,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         n_quantiles: int = 51,
         **kwargs: Any,
     ):
-        check_number("n_quantiles", n_quantiles, 1, whole=True)
+        check_arguments({"n_quantiles": n_quantiles}, POLICY)
         super().__init__(observation_space, action_space, lr_schedule, n_quantiles=n_quantiles, **kwargs)
 
     @property

@@ -2,18 +2,17 @@
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
+from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import categorical_loss, categorical_projection
 from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.validation import check_number
 
 
 class EqRCategoricalNetwork(EqRNetwork, QNetwork):
@@ -93,9 +92,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         v_max: float = 10.0,
         **kwargs: Any,
     ):
-        check_number("n_atoms", n_atoms, 2, whole=True)
-        check_number("v_min", v_min, -np.inf)
-        check_number("v_max", v_max, -np.inf)
+        check_arguments({"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max}, POLICY)
         if v_min >= v_max:
             raise ValueError(
                 f"v_min: expected a number below v_max = {v_max}, found {v_min}. Pass the lowest possible return."

@@ -15,7 +15,7 @@ from blind_cliffwalk import make_model, updates_needed
 
 def test_the_environment_is_one():
     check_env(BlindCliffwalk(4), skip_render_check=True)
-    with pytest.raises(ValueError, match="n_states: expected a whole number of at least 1, found 0"):
+    with pytest.raises(ValueError, match="n_states must be an integer >= 1, got 0"):
         BlindCliffwalk(0)
 
 

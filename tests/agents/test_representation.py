@@ -108,7 +108,7 @@ def test_weight_of_the_td_loss(make):
         name: model.logger.name_to_value[f"train/{name}"]
         for name in ("loss", "td_loss", "aet_loss", "symmetry_loss", "reward_loss")
     }
-    expected = 0.5 * logged["td_loss"] + 2 * logged["aet_loss"] + logged["symmetry_loss"] + logged["reward_loss"]
+    expected = 0.5 * logged["td_loss"] + 2 * logged["aet_loss"] + logged["symmetry_loss"] + 5 * logged["reward_loss"]
     assert logged["loss"] == pytest.approx(expected, rel=1e-5)
 
 
@@ -148,11 +148,11 @@ def test_the_switches_train_and_are_saved(make, settings, tmp_path):
 
 
 def test_what_is_not_legal():
-    with pytest.raises(ValueError, match=r"aet_loss: expected one of .*contrastive.*found 'nce'"):
+    with pytest.raises(ValueError, match=r"aet_loss must be one of .*contrastive.*got 'nce'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"aet_loss": "nce"})
-    with pytest.raises(ValueError, match=r"projection: expected one of .*found 'mine'"):
+    with pytest.raises(ValueError, match=r"projection must be one of .*got 'mine'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "mine"})
-    with pytest.raises(ValueError, match="td_coef: expected a finite number of at least 0"):
+    with pytest.raises(ValueError, match="td_coef must be a finite number >= 0"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=-1)
     with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)

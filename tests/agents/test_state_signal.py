@@ -143,5 +143,5 @@ def test_a_convolutional_transition_needs_a_map():
         EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs={"transition": "convolutional", "group": None})
     with pytest.raises(ValueError, match=r"symmetry_coef: the GET loss needs"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional", "group": None})
-    with pytest.raises(ValueError, match=r"transition: expected one of"):
+    with pytest.raises(ValueError, match=r"transition must be one of"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"transition": "linear"})

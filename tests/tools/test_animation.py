@@ -274,7 +274,7 @@ def test_what_cannot_be_filmed_is_refused(make, tmp_path):
     model = make(ChainEnv(8))
     with pytest.raises(ValueError, match="formats: expected some of"):
         record(model, ChainEnv(), tmp_path / "v", formats=("avi",))
-    with pytest.raises(ValueError, match="n_steps: expected a whole number of at least 6"):
+    with pytest.raises(ValueError, match="n_steps must be an integer >= 6"):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
     with pytest.raises(ValueError, match="env: expected the agent's observation_space"):
         record(model, ImageEnv(), tmp_path / "v")

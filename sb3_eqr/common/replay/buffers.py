@@ -9,10 +9,10 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_eqr.common.arguments import BUFFER, check_arguments
 from sb3_eqr.common.replay.frame_store import FrameStore
 from sb3_eqr.common.replay.sum_tree import SumTree
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
-from sb3_eqr.common.validation import check_number
 
 try:
     import psutil
@@ -93,9 +93,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             )
 
     def _check_arguments(self, frame_stack: int) -> None:
-        check_number("n_steps", self.n_steps, 1, whole=True)
-        check_number("prediction_depth", self.prediction_depth, 0, whole=True)
-        check_number("gamma", self.gamma, 0, 1)
+        check_arguments({**vars(self), "frame_stack": frame_stack}, BUFFER)
         needed = self.n_steps + self.prediction_depth + 1
         if self.buffer_size < needed:
             raise ValueError(
@@ -322,9 +320,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
             prediction_depth,
             frame_stack,
         )
-        check_number("alpha (priority exponent)", alpha, 0)
-        check_number("beta (importance weights)", beta, 0, 1)
-        check_number("final_beta (importance weights)", final_beta, 0, 1)
+        check_arguments({"alpha": alpha, "beta": beta, "final_beta": final_beta}, BUFFER)
         self.alpha = alpha
         self.beta = self.initial_beta = beta
         self.final_beta = final_beta

@@ -1,0 +1,190 @@
+"""What each argument may be, in one table: the constructors check by it, the tests read it."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+
+class Rule(NamedTuple):
+    """
+    :param says: what a value must be, as it stands in messages: "an integer >= 1"
+    :param holds: whether a value is
+    """
+
+    says: str
+    holds: Callable[[Any], bool]
+
+    def __or__(self, other: "Rule") -> "Rule":
+        return Rule(f"{self.says} or {other.says}", lambda value: self.holds(value) or other.holds(value))
+
+
+def number(low: float = -np.inf, high: float = np.inf, above: bool = False) -> Rule:
+    """A finite number in [low, high]; with ``above``, in (low, high]. Flags are no numbers."""
+    return _in_range("a finite number", (int, float, np.integer, np.floating), low, high, above)
+
+
+def integer(low: float = -np.inf, high: float = np.inf) -> Rule:
+    """An integer in [low, high]. 32.0 is none, and neither are flags."""
+    return _in_range("an integer", (int, np.integer), low, high, False)
+
+
+def _in_range(kind: str, types: tuple[type, ...], low: float, high: float, above: bool) -> Rule:
+    bounds = f" in {'(' if above else '['}{low:g}, {high:g}]"
+    if high == np.inf:
+        bounds = "" if low == -np.inf else f" {'>' if above else '>='} {low:g}"
+
+    def holds(value: Any) -> bool:
+        if isinstance(value, bool) or not isinstance(value, types):
+            return False
+        found: Any = value
+        return bool((low < found if above else low <= found) and found <= high and abs(found) < np.inf)
+
+    return Rule(kind + bounds, holds)
+
+
+def one_of(choices: Iterable[Any]) -> Rule:
+    """One of a few strings."""
+    legal = list(choices)
+    return Rule(f"one of {legal}", lambda value: isinstance(value, str) and value in legal)
+
+
+def a(kind: type, says: str) -> Rule:
+    """An instance of a class."""
+    return Rule(says, lambda value: isinstance(value, kind))
+
+
+def a_subclass(kind: type, says: str) -> Rule:
+    """A class derived from another one."""
+    return Rule(says, lambda value: isinstance(value, type) and issubclass(value, kind))
+
+
+def a_list(of: Rule) -> Rule:
+    """A list or tuple of values that a rule holds for."""
+    says = of.says.removeprefix("an ").removeprefix("a ").replace("integer", "integers", 1)
+    return Rule(f"a list of {says}", lambda value: isinstance(value, (list, tuple)) and all(map(of.holds, value)))
+
+
+FLAG = Rule("True or False", lambda value: isinstance(value, (bool, np.bool_)))
+TEXT = a(str, "a string")
+NONE = Rule("None", lambda value: value is None)
+DICTIONARY = a(Mapping, "a dictionary")
+FUNCTION = Rule("a schedule", callable)
+SHARE = number(0, 1)
+WEIGHT = number(0)
+FREQUENCY = integer(1) | Rule(
+    "a pair such as (1, 'episode')",
+    lambda value: (
+        isinstance(value, (tuple, list))
+        and len(value) == 2
+        and integer(1).holds(value[0])
+        and getattr(value[1], "value", value[1]) in ("step", "episode")
+    ),  # SB3 makes it an enum
+)
+
+ALGORITHM: dict[str, Rule] = {
+    "learning_rate": WEIGHT | FUNCTION,
+    "buffer_size": integer(1),
+    "learning_starts": integer(0),
+    "batch_size": integer(1),
+    "tau": SHARE,
+    "gamma": SHARE,
+    "train_freq": FREQUENCY,
+    "gradient_steps": integer(-1),
+    "replay_buffer_kwargs": DICTIONARY | NONE,
+    "optimize_memory_usage": FLAG,
+    "n_steps": integer(1),
+    "target_update_interval": integer(1) | NONE,
+    "exploration_fraction": SHARE,
+    "exploration_initial_eps": WEIGHT,
+    "exploration_final_eps": SHARE,
+    "max_grad_norm": number(0, above=True) | NONE,
+    "prediction_depth": integer(0),
+    "aet_coef": WEIGHT,
+    "symmetry_coef": WEIGHT,
+    "reward_coef": WEIGHT,
+    "td_coef": WEIGHT,
+    "aux_gradient_share": WEIGHT | NONE,
+    "double_q": FLAG,
+    "prioritized_replay": FLAG,
+    "shift_pixels": integer(0),
+    "intensity_scale": WEIGHT,
+    "cuda_graph": FLAG,
+    "stats_window_size": integer(1),
+    "tensorboard_log": TEXT | NONE,
+    "policy_kwargs": DICTIONARY | NONE,
+    "verbose": integer(0, 2),
+    "seed": integer(0, 2**32 - 1) | NONE,
+}
+POLICY: dict[str, Rule] = {
+    "net_arch": a_list(integer(1)) | NONE,
+    "activation_fn": a_subclass(nn.Module, "a class of torch.nn such as nn.ReLU"),
+    "features_extractor_class": a_subclass(BaseFeaturesExtractor, "a features extractor of SB3") | TEXT | NONE,
+    "features_extractor_kwargs": DICTIONARY | NONE,
+    "normalize_images": FLAG,
+    "optimizer_class": a_subclass(th.optim.Optimizer, "a class of torch.optim") | TEXT,
+    "optimizer_kwargs": DICTIONARY | NONE,
+    "n_blocks": integer(1) | NONE,
+    "parameterization": TEXT,
+    "whiten": FLAG,
+    "layer_norm": FLAG,
+    "skip_connection": FLAG,
+    "dueling": FLAG,
+    "noisy": FLAG,
+    "sigma_init": WEIGHT,
+    "transition": one_of(["group", "convolutional"]),
+    "latent_hidden_dim": integer(1),
+    "projection": one_of(["head", "own", "none"]),
+    "predictor": FLAG,
+    "latent_tau": SHARE | NONE,
+    "state_dependent_actions": FLAG,
+    "act_with_target": FLAG,
+    "reward_loss": one_of(["mse", "categorical"]),
+    "aet_loss": one_of(["distance", "contrastive"]),
+    "n_atoms": integer(2),
+    "v_min": number(),
+    "v_max": number(),
+    "n_quantiles": integer(1),
+}
+BUFFER: dict[str, Rule] = {
+    "n_steps": integer(1),
+    "gamma": SHARE,
+    "prediction_depth": integer(0),
+    "frame_stack": integer(1),
+    "n_envs": integer(1),
+    "alpha": WEIGHT,
+    "beta": SHARE,
+    "final_beta": SHARE,
+}
+RESETS: dict[str, Rule] = {
+    "interval": integer(1) | NONE,
+    "shrink_factor": SHARE,
+    "end": SHARE,
+    "initial_n_steps": integer(1) | NONE,
+    "initial_gamma": SHARE | NONE,
+    "annealing_steps": integer(1),
+}
+
+
+def check(name: str, value: Any, rule: Rule) -> None:
+    """
+    :param name: of the argument, as it stands in the message
+    :raises ValueError: if the rule does not hold for the value
+    """
+    if not rule.holds(value):
+        raise ValueError(f"{name} must be {rule.says}, got {value!r}.")
+
+
+def check_arguments(values: Mapping[str, Any], rules: Mapping[str, Rule], prefix: str = "") -> None:
+    """
+    :param values: by name; those without a rule are left to others
+    :param rules: one of the tables above
+    :param prefix: before each name in messages
+    :raises ValueError: for the first value that is not what it must be
+    """
+    for name, rule in rules.items():
+        if name in values:
+            check(prefix + name, values[name], rule)

@@ -1,0 +1,97 @@
+"""Every argument of every constructor refuses what it must not be, in words that name it."""
+
+import inspect
+from datetime import timedelta
+
+import numpy as np
+import pytest
+
+from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
+from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
+from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.resets import ResetSchedule
+from sb3_eqr.eqr_qrdqn import EqRQRDQNPolicy
+from sb3_eqr.eqr_rainbow import EqRRainbowPolicy
+from tests.toys import ChainEnv
+
+NOT_IN_A_TABLE = {
+    # the algorithm: checked by SB3 or by sb3_eqr.common.validation, which know what they belong to
+    *("self", "policy", "env", "replay_buffer_class", "resets", "device", "_init_setup_model"),
+    # the policy: given by the algorithm, or read by make_group
+    *("observation_space", "action_space", "lr_schedule", "group", "kwargs", "stock_kwargs"),
+    # the buffer: given by the algorithm, or without effect
+    *("buffer_size", "optimize_memory_usage", "handle_timeout_termination"),
+}
+NAN = float("nan")
+# What no argument may be, by the kind of thing that it is; a rule is asked about each.
+STRANGERS = [NAN, float("inf"), -float("inf"), -1, -0.5, 1e400, 0.5, 3.0, 7, "many", "", True, None, [], {}, (), object]
+STRANGERS += [
+    b"1",
+    1j,
+    np.array([1.0, 2.0]),
+    [0],
+    [1, "x"],
+    (0, "step"),
+    (1, "hour"),
+    timedelta(1),
+    np.float64(NAN),
+    np.int64(-3),
+]
+
+
+def make(place, name, value):
+    if place == "resets":
+        return ResetSchedule(**{name: value})
+    if place == "algorithm":
+        return EqRRainbow("MlpPolicy", ChainEnv(), **{"buffer_size": 200, name: value})
+    kind = EqRQRDQN if name == "n_quantiles" else EqRRainbow
+    return kind("MlpPolicy", ChainEnv(), buffer_size=200, **{place: {name: value}})
+
+
+OWN_BUFFER = ("frame_stack", "alpha", "beta", "final_beta")  # the others are the algorithm's
+PLACES = {"algorithm": ALGORITHM, "policy_kwargs": POLICY, "resets": RESETS}
+PLACES["replay_buffer_kwargs"] = {name: BUFFER[name] for name in OWN_BUFFER}
+ARGUMENTS = [(place, name) for place, rules in PLACES.items() for name in rules]
+
+
+@pytest.mark.parametrize("place, name", ARGUMENTS)
+def test_what_it_must_not_be_is_refused_by_name(place, name):
+    rule = PLACES[place][name]
+    wrong = [value for value in STRANGERS if not rule.holds(value)]
+    assert len(wrong) > 10
+    for value in wrong:
+        with pytest.raises(ValueError, match=rf"\b{name} must be .*, got ") as caught:
+            make(place, name, value)
+        assert rule.says in str(caught.value)
+
+
+def test_no_argument_is_without_a_rule():
+    signatures = {
+        EqRRainbow: ALGORITHM,
+        EqRPolicy: POLICY,
+        EqRRainbowPolicy: POLICY,
+        EqRQRDQNPolicy: POLICY,
+        PrioritizedSequenceReplayBuffer: BUFFER,
+        ResetSchedule: RESETS,
+    }
+    for kind, rules in signatures.items():
+        missing = inspect.signature(kind.__init__).parameters.keys() - rules.keys() - NOT_IN_A_TABLE
+        assert not missing, (kind, missing)
+
+
+@pytest.mark.parametrize("name", ["max_grad_norm", "gamma", "aet_coef", "batch_size"])
+def test_what_is_set_later_is_checked_when_learning_starts(name):
+    model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=10)
+    setattr(model, name, -1)
+    with pytest.raises(ValueError, match=f"{name} must be .*, got -1"):
+        model.learn(20)
+    assert model.num_timesteps == 0
+
+
+def test_rules_by_hand():
+    assert number(0, 1).holds(1) and not number(0, 1).holds(1.1) and not number(0, above=True).holds(0)
+    assert integer(1).holds(np.int64(1)) and not integer(1).holds(1.0) and not integer(0).holds(True)
+    assert a_list(integer(1)).holds([64, 64]) and a_list(integer(1)).holds([]) and not a_list(integer(1)).holds([64.0])
+    assert (integer(1) | one_of(["auto"])).holds("auto") and not one_of(["auto"]).holds(None)
+    assert number(0, above=True).says == "a finite number > 0" and number(0, 1).says == "a finite number in [0, 1]"
+    assert a_list(integer(1)).says == "a list of integers >= 1"
