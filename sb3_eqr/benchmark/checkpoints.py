@@ -1,7 +1,6 @@
 """Checkpoints of a run: everything that training goes on from, in a folder that appears whole or not at all."""
 
 import io
-import os
 import pathlib
 import pickle
 import shutil
@@ -13,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
+from sb3_eqr.common.files import atomic_folder
 from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 
 PREFIX = "checkpoint-"  # and the step
@@ -98,27 +98,17 @@ def write_checkpoint(folder: pathlib.Path, model: BaseAlgorithm, record: dict[st
     """
     env = model.get_env()
     assert env is not None
-    name = f"{PREFIX}{model.num_timesteps:012d}"
-    partial = folder / f".{name}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir(parents=True)
+    old = find_checkpoints(folder)
+    checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
+    with atomic_folder(checkpoint) as partial:  # one of the same step stays: nothing has happened since
         model.save(partial / "model.zip")
         if isinstance(model, OffPolicyAlgorithm) and not is_final:
             model.save_replay_buffer(partial / "replay_buffer.pkl")
         state = {"record": record, "rng": get_rng_state(model.action_space), "environment": pickle_environment(env)}
         (partial / "state.pkl").write_bytes(cloudpickle.dumps(state))
-        for file in partial.iterdir():
-            with open(file, "rb") as written:
-                os.fsync(written.fileno())
-        old = find_checkpoints(folder)
-        if old and old[-1].name == name:  # of the same step: nothing has happened since
-            return
-        os.replace(partial, folder / name)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    for checkpoint in old:
-        shutil.rmtree(checkpoint, ignore_errors=True)
+    for path in old:
+        if path != checkpoint:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def find_checkpoints(folder: pathlib.Path) -> list[pathlib.Path]:

@@ -11,7 +11,7 @@ from sb3_eqr.benchmark.analysis import Analysis, aggregates_file, analyse, notes
 from sb3_eqr.benchmark.comparison import compare
 from sb3_eqr.benchmark.pictures import all_pictures
 from sb3_eqr.benchmark.tables import Table, game_table, summary_table, to_html, to_latex, to_markdown
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 
 REPS = 2_000  # bootstrap samples, as rliable's profiles
 METHOD = (

@@ -6,7 +6,7 @@ import pathlib
 from typing import Any
 
 from sb3_eqr.benchmark.agents import Agent
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"
 STARTS = "starts.txt"  # a line whenever the run is begun or resumed

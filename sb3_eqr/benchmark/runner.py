@@ -16,7 +16,7 @@ from rich.table import Table
 from sb3_eqr.benchmark.plan import State, seconds_left, state_of
 from sb3_eqr.benchmark.run import ERROR, Run, Settings
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 
 ATTEMPTS = 2  # a run that crashes is retried once
 REFRESH_SECONDS = 2.0

@@ -10,7 +10,7 @@ import yaml
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.zoo.checks import nearest
 

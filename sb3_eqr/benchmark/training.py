@@ -24,7 +24,7 @@ from sb3_eqr import envs
 from sb3_eqr.benchmark.checkpoints import find_checkpoints, load_checkpoint, remove_checkpoints, write_checkpoint
 from sb3_eqr.benchmark.recording import Clock, LossWriter, RunCallback, add_evaluation, new_record
 from sb3_eqr.benchmark.run import ERROR, LOCK, PROGRESS, RESULT, STARTS, Run, Settings, write_json
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 from sb3_eqr.zoo import register
 
 PACKAGES = (

@@ -2,14 +2,12 @@
 
 import io
 import json
-import os
 import pathlib
 import pickle
 import random
 import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any, BinaryIO, TypeVar
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -19,30 +17,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_eqr.common.files import atomic_write
+
 SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
-
-
-@contextmanager
-def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
-    """
-    A file opened beside ``path`` that takes its place only once it is written whole.
-
-    :param path: destination; ``suffix`` is appended where it has none, and its folder is made, as SB3 does
-    :param suffix: without the dot
-    """
-    path = pathlib.Path(path)
-    if path.suffix == "":
-        path = path.with_suffix(f".{suffix}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def is_whole_model(path: pathlib.Path) -> bool:

@@ -13,8 +13,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.groups import NoGroup
-from sb3_eqr.common.save_util import atomic_write, get_rng_state, set_rng_state
+from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter

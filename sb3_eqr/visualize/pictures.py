@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
-from sb3_eqr.common.save_util import atomic_write
+from sb3_eqr.common.files import atomic_write
 from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
 from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.measures import ROUNDING, Transition

@@ -1,0 +1,123 @@
+"""Files and folders that are complete or absent, whoever else writes there and whenever a process is killed."""
+
+import contextlib
+import glob
+import os
+import pathlib
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import BinaryIO
+
+try:
+    import fcntl
+except ImportError:  # Windows: leftovers of killed processes stay there
+    fcntl = None  # type: ignore[assignment]
+
+
+@contextmanager
+def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
+    """
+    A file opened beside ``path`` that takes its place only once it is complete and on the disk. Of two writers the last one
+    wins. What killed ones have left beside ``path`` is removed.
+
+    :param path: destination; ``suffix`` is appended where it has none, and its folder is made, as SB3 does
+    :param suffix: without the dot
+    """
+    path = pathlib.Path(path)
+    if path.suffix == "":
+        path = path.with_suffix(f".{suffix}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _partial(path, is_folder=False) as partial:
+        with open(partial, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+        _sync(path.parent)
+
+
+@contextmanager
+def atomic_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """
+    A new folder beside ``path`` that takes its name only once it is complete and on the disk. If there is a ``path`` by then,
+    that one stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _partial(path, is_folder=True) as partial:
+        yield partial
+        for found in [*partial.rglob("*"), partial]:
+            _sync(found)
+        with contextlib.suppress(FileExistsError, NotADirectoryError):
+            if not path.exists():
+                os.rename(partial, path)
+        _sync(path.parent)
+
+
+@contextmanager
+def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
+    """
+    An empty file or folder beside ``path`` whose name nobody else has, gone afterwards. As long as it is written, its process
+    holds a lock of it: one without a lock is a leftover.
+    """
+    _remove_leftovers(path)
+    descriptor = None
+    while descriptor is None:  # it may be taken for a leftover before it is locked
+        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+        partial.mkdir() if is_folder else partial.touch()
+        with contextlib.suppress(FileNotFoundError):
+            descriptor = _open(partial)
+            if _lock(descriptor) is False or not partial.exists():
+                os.close(descriptor)
+                descriptor = None
+    try:
+        yield partial
+    finally:
+        _remove(partial)
+        os.close(descriptor)  # and the lock with it
+
+
+def _remove_leftovers(path: pathlib.Path) -> None:
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.partial"):
+        with contextlib.suppress(OSError):
+            descriptor = _open(leftover)
+            try:
+                if _lock(descriptor):
+                    _remove(leftover)
+            finally:
+                os.close(descriptor)
+
+
+def _open(path: pathlib.Path) -> int:
+    return os.open(os.devnull if os.name == "nt" and path.is_dir() else path, os.O_RDONLY)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether the lock is ours now; ``None`` if there are no locks on this system or in this folder."""
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return None
+
+
+def _remove(path: pathlib.Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _sync(path: pathlib.Path) -> None:
+    """Onto the disk; Windows has no such call for folders."""
+    with contextlib.suppress(PermissionError):
+        descriptor = _open(path)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

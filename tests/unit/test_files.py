@@ -1,0 +1,94 @@
+"""Files and folders are complete or absent, whoever writes."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from sb3_eqr.common.files import atomic_folder, atomic_write
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "deep" / "model"
+    with atomic_write(path, "zip") as file:
+        file.write(b"old")
+    with pytest.raises(RuntimeError), atomic_write(path, "zip") as file:
+        file.write(b"half")
+        raise RuntimeError
+    assert names(path.parent) == ["model.zip"] and (path.parent / "model.zip").read_bytes() == b"old"
+
+
+def hang(path):
+    """Write half a file, and half a folder, and never end."""
+    with atomic_write(path, "bin") as file, atomic_folder(path.with_name("folder")) as folder:
+        file.write(b"half")
+        file.flush()
+        (folder / "half").write_bytes(b"half")
+        time.sleep(60)
+
+
+def test_leftovers_of_killed_processes_are_removed_and_living_ones_are_not(tmp_path):
+    path = tmp_path / "file.bin"
+    context = multiprocessing.get_context("spawn")
+    dead, alive = (context.Process(target=hang, args=(path,)) for _ in range(2))
+    dead.start()
+    while len(names(tmp_path)) < 2 or not list(tmp_path.glob(".folder*/half")):
+        time.sleep(0.01)
+    os.kill(dead.pid, signal.SIGKILL)
+    dead.join()
+    left = names(tmp_path)
+    alive.start()
+    try:
+        while len(set(names(tmp_path)) - set(left)) < 2 or not list(tmp_path.glob(".folder*/half")):
+            time.sleep(0.01)
+        assert set(names(tmp_path)).isdisjoint(left)  # the new writer has removed them
+        with atomic_write(path, "bin") as file, atomic_folder(tmp_path / "folder"):
+            file.write(b"whole")
+        assert len(names(tmp_path)) == 4 and path.read_bytes() == b"whole"  # beside those of the living
+    finally:
+        alive.kill()
+        alive.join()
+    with atomic_write(path, "bin") as file, atomic_folder(tmp_path / "folder"):
+        file.write(b"last")
+    assert names(tmp_path) == ["file.bin", "folder"]
+
+
+def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
+    path, errors = tmp_path / "file.bin", []
+
+    def write(number):
+        try:
+            for _ in range(20):
+                with atomic_write(path, "bin") as file:
+                    file.write(bytes([number]) * 5_000)
+                content = path.read_bytes()
+                assert len(content) == 5_000 and len(set(content)) == 1
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors and names(tmp_path) == ["file.bin"]
+
+
+def test_a_folder_appears_with_everything_and_stays_the_first_one(tmp_path):
+    path = tmp_path / "checkpoint"
+    with atomic_folder(path) as folder:
+        (folder / "deep").mkdir()
+        (folder / "deep" / "a").write_text("first")
+        assert not path.exists()
+    with atomic_folder(path) as folder:
+        (folder / "b").write_text("second")
+    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "other"):
+        raise RuntimeError
+    assert names(tmp_path) == ["checkpoint"] and names(path) == ["deep"]
