@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_eqr.common import validation
-from sb3_eqr.common.arguments import ALGORITHM, POLICY, check_arguments
+from sb3_eqr.common.arguments import ALGORITHM, POLICY, check, check_arguments, number
 from sb3_eqr.common.cuda_graph import CapturedGradients
 from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
@@ -220,13 +220,13 @@ class EqRAlgorithm(SafeFiles):
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
-        augmentation = self.shift_pixels, self.intensity_scale
-        self.objective = Objective(self.policy, self.double_q, *augmentation, self.aux_gradient_share)
+        options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share
+        self.objective = Objective(self.policy, *options)
         self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
         keep_freed_memory()
 
     def _check_arguments(self) -> None:
-        self._check_values()
+        check_arguments(vars(self), ALGORITHM)
         name = type(self).__name__
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
@@ -240,9 +240,6 @@ class EqRAlgorithm(SafeFiles):
                 "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
                 "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
             )
-
-    def _check_values(self) -> None:
-        check_arguments({**vars(self), "stats_window_size": self._stats_window_size}, ALGORITHM)
 
     @property
     def depth(self) -> int:
@@ -280,7 +277,7 @@ class EqRAlgorithm(SafeFiles):
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        self._check_values()  # of attributes that were set since
+        check_arguments(vars(self), ALGORITHM)  # attributes may have been set since
         result = super()._setup_learn(*args, **kwargs)
         validation.check_finite("observation", self._last_obs, self.num_timesteps)
         return result
@@ -377,15 +374,17 @@ class EqRAlgorithm(SafeFiles):
             self.logger.record("train/n_resets", len(self._resets.done))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _log_last_round(self) -> None:
-        """Log the metrics of the last round, which are computed by now; roll back if one is not finite."""
+    def _log_last_round(self, check_model: bool = False) -> None:
+        """Log the last round's metrics, which are computed by now; roll back if one, or the model, is not finite."""
         try:
             for name, value in self._monitor.collect().items():
                 self.logger.record_mean(f"train/{name}", value)
+            if check_model:
+                self._monitor.check_model(self._n_updates)
         except BadUpdateError as error:
             self._n_updates = error.n_updates
             self._resets.roll_back(error.n_updates)
-            raise
+            raise BadUpdateError(f"step {self.num_timesteps}, {error}", error.n_updates) from None
 
     def learn(
         self: SelfEqRAlgorithm,
@@ -397,9 +396,10 @@ class EqRAlgorithm(SafeFiles):
         progress_bar: bool = False,
     ) -> SelfEqRAlgorithm:
         """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
+        check("total_timesteps", total_timesteps, number(0))
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
-        self._log_last_round()
+        self._log_last_round(check_model=True)
         return self
 
     def dump_logs(self) -> None:
@@ -442,7 +442,7 @@ class EqRAlgorithm(SafeFiles):
         return self
 
     def _before_saving(self) -> None:
-        self._log_last_round()  # a model whose last update went wrong is put back and not saved
+        self._log_last_round(check_model=True)  # a model whose last update went wrong is put back and not saved
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_monitor", "_trained", "objective", "_captured"]

@@ -1,6 +1,6 @@
 """The metrics of each update, read when they are long computed, and the way back from an update that went wrong."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import torch as th
@@ -87,17 +87,42 @@ class UpdateMonitor:
         first = int(np.argmin(finite.all(axis=1)))
         bad_update = self._round_start + first + 1
         is_first = bad_update == self._last.n_updates + 1  # after the last backup, which may be of a spoilt model
-        sound = self._sound if is_first and self._sound is not None else self._last
-        self._last = self._sound = None
-        self._model.load_state_dict(sound.model)
-        self._optimizer.load_state_dict(sound.optimizer)
         wrong = [f"{n} = {v}" for n, v, ok in zip(self._names, metrics[first], finite[first], strict=True) if not ok]
-        raise BadUpdateError(
-            f"update {bad_update}: expected finite losses, found {', '.join(wrong)}. "
-            f"The model was put back to update {sound.n_updates} and can be saved. "
-            "Lower learning_rate or max_grad_norm, or check the scale of observations and rewards.",
-            sound.n_updates,
+        self._roll_back(
+            bad_update, "losses", ", ".join(wrong), self._sound if is_first and self._sound is not None else self._last
         )
+
+    def check_model(self, n_updates: int) -> None:
+        """
+        What the losses cannot show: whether the last update has left finite parameters.
+
+        :param n_updates: updates done
+        :raises BadUpdateError: if not; model and optimiser are then as they last were sound
+        """
+        found = _largest(self._model.state_dict())
+        if not np.isfinite(found):
+            backups = [backup for backup in (self._last, self._sound) if backup and np.isfinite(_largest(backup.model))]
+            self._roll_back(n_updates, "parameters", str(found), backups[0] if backups else None)
+
+    def _roll_back(self, bad_update: int, what: str, found: str, sound: Backup | None) -> NoReturn:
+        self._pending.clear()
+        self._last = self._sound = None
+        state = "There is no sound model to put back: load an earlier file."
+        if sound is not None:
+            self._model.load_state_dict(sound.model)
+            self._optimizer.load_state_dict(sound.optimizer)
+            state = f"The model was put back to update {sound.n_updates} and can be saved."
+        raise BadUpdateError(
+            f"update {bad_update}: expected finite {what}, found {found}. {state} "
+            "Lower learning_rate or max_grad_norm, or check the scale of observations and rewards.",
+            bad_update if sound is None else sound.n_updates,
+        )
+
+
+def _largest(state: dict[str, Any]) -> float:
+    """The largest absolute number in a state dict: not finite if one of them is not."""
+    tensors = [tensor for tensor in state.values() if tensor.is_floating_point() and tensor.numel()]
+    return th.stack(th._foreach_norm(tensors, float("inf"))).max().item()
 
 
 def _cloned(state: Any) -> Any:

@@ -191,6 +191,40 @@ def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, grad
     model.learn(5, reset_num_timesteps=False)
 
 
+@EITHER
+def test_the_very_last_update_is_looked_at_before_learn_returns(make, tmp_path):
+    """Its losses are finite; what its step has done shows in the parameters alone."""
+    model = make(ChainEnv(), learning_starts=40, gradient_steps=1)
+
+    class Callback(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 60:
+                model.lr_schedule = lambda progress: float("inf")
+            return True
+
+    with pytest.raises(
+        FloatingPointError, match=r"step 60, update \d+: expected finite parameters, found (nan|inf)\. The model"
+    ):
+        model.learn(60, callback=Callback())
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+    model.save(tmp_path / "model")
+
+
+def test_parameters_that_are_not_finite_are_never_saved(make, tmp_path):
+    model = make(ChainEnv())
+    with th.no_grad():
+        next(model.policy.parameters())[0] = float("nan")
+    with pytest.raises(FloatingPointError, match="There is no sound model to put back"):
+        model.save(tmp_path / "model")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", [-5, float("nan"), "many", None, True])
+def test_steps_that_cannot_be_made(make, wrong):
+    with pytest.raises(ValueError, match="total_timesteps must be a finite number >= 0, got"):
+        make(ChainEnv()).learn(wrong)
+
+
 def test_moving_n_beyond_the_buffer_is_refused(make):
     model = make(ChainEnv(), buffer_size=50).learn(60)
     model.n_steps = 60
