@@ -52,7 +52,9 @@ def main(algorithm: str, folder: pathlib.Path, steps: int) -> None:
     env.unwrapped.reset()  # Monitor wants it; the states are set below
     if isinstance(env, VecNormalize):
         env.returns = pickle.loads((folder / "returns.pkl").read_bytes())
-    model = getattr(sb3_eqr, algorithm).load(folder / "model", env=env, device="cpu", force_reset=False)
+    model = getattr(sb3_eqr, algorithm).load(
+        folder / "model", env=env, device="cpu", force_reset=False, trust=True
+    )  # a lambda
     model.load_replay_buffer(folder / "buffer")
     for index, state in enumerate(pickle.loads((folder / "env.pkl").read_bytes())):
         env.env_method("set_state", state, indices=index)

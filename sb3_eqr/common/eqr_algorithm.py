@@ -25,7 +25,7 @@ from sb3_eqr.common.optimizers import set_adam_defaults
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
-from sb3_eqr.common.save_util import SafeFiles, read_description
+from sb3_eqr.common.save_util import SafeFiles, read_data
 from sb3_eqr.common.transfer import load_representation, representation
 from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
@@ -412,7 +412,8 @@ class EqRAlgorithm(SafeFiles):
     ) -> None:
         """As SB3's ``set_parameters``; a file with parameters for another group or return distribution raises ValueError."""
         if not isinstance(load_path_or_dict, dict):
-            validation.check_same_parameters(self.policy_description, read_description(load_path_or_dict))
+            saved = read_data(load_path_or_dict).get("policy_description", {})
+            validation.check_same_parameters(self.policy_description, saved)
         self._monitor.forget()
         super().set_parameters(load_path_or_dict, exact_match, device)
         for parameter, state in self.policy.optimizer.state.items():

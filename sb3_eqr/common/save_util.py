@@ -1,10 +1,12 @@
 """Saving that never leaves half a file and keeps the random generators, for any off-policy algorithm."""
 
+import inspect
 import io
 import json
 import pathlib
 import pickle
 import random
+import warnings
 import zipfile
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -15,9 +17,13 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import open_path, recursive_getattr, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.plain_data import UntrustedError, decode, encode
+from sb3_eqr.common.replay.buffer_files import read_buffer, write_buffer
+from sb3_eqr.common.validation import check_names
 
 SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 
@@ -35,20 +41,42 @@ def is_whole_model(path: pathlib.Path) -> bool:
         return False
 
 
-def read_description(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, str]:
+def read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
     """
-    ``EqRPolicy.description`` of the model in a file (or file-like, which is left where it was); empty for one of another
-    algorithm. Nothing in the file is executed for it.
+    The attributes of the model in a file (or file-like, which is left where it was), as the JSON that they are saved as; empty
+    if it is no model. Nothing in the file is executed for it.
     """
     place = path if isinstance(path, (str, pathlib.Path)) else path.tell()
     found = find_file(path) if isinstance(path, (str, pathlib.Path)) else path
     if found is None or not zipfile.is_zipfile(found):
         return {}  # SB3 says what is wrong
     with zipfile.ZipFile(found) as archive:  # type: ignore[arg-type]
-        description = json.loads(archive.read("data")).get("policy_description", {})
+        data = json.loads(archive.read("data"))
     if not isinstance(path, (str, pathlib.Path)):
         path.seek(place)  # type: ignore[arg-type]
-    return description
+    return data
+
+
+def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
+    """
+    Attributes from their JSON.
+
+    :param path: for messages
+    :raises ValueError: if only a pickle holds one of them and ``trust`` is not given
+    """
+    found, refused = {}, {}
+    for name, value in data.items():
+        try:
+            found[name] = decode(value, trust)
+        except UntrustedError as error:
+            refused[name] = str(error)
+    if refused:
+        named = "; ".join(f"{name}: {names}" for name, names in refused.items())
+        raise ValueError(
+            f"{path}: the file holds Python objects, whose loading runs code that it names ({named}). "
+            f"If you know where the file comes from, pass trust=True, or custom_objects for {', '.join(refused)}."
+        )
+    return found
 
 
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
@@ -90,14 +118,26 @@ class SafeFiles(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """As SB3's ``save``, with the state of the random generators; the file is written beside and renamed."""
+        """
+        As SB3's ``save``, with the state of the random generators; the file is written beside and renamed. Attributes are
+        plain data (:mod:`~sb3_eqr.common.plain_data`); a class of your own in ``policy_kwargs`` is pickled, and needs
+        ``trust`` to be loaded.
+        """
         self._before_saving()
         self.rng_state = get_rng_state(self.action_space)
+        names, variable_names = self._get_torch_save_params()
+        excluded = {*(exclude or []), *self._excluded_save_params()} - {*(include or [])}
+        excluded |= {name.split(".")[0] for name in [*names, *variable_names]}
+        data = {name: encode(value) for name, value in vars(self).items() if name not in excluded}
+        variables = {name: recursive_getattr(self, name) for name in variable_names}
         if not isinstance(path, (str, pathlib.Path)):
-            super().save(path, exclude, include)
+            save_to_zip_file(path, data, self.get_parameters(), variables)
             return
         with atomic_write(path, "zip") as file:
-            super().save(file, exclude, include)  # type: ignore[arg-type]
+            save_to_zip_file(file, data, self.get_parameters(), variables)  # type: ignore[arg-type]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # made by _setup_model
 
     def _before_saving(self) -> None:
         """Called before a model is written; an exception keeps the old file."""
@@ -111,15 +151,20 @@ class SafeFiles(OffPolicyAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        trust: bool = False,
         **kwargs: Any,
     ) -> SelfSafeFiles:
         """
-        As SB3's ``load``, with the same parameters. If the model has a seed (and no other is given here), the random
+        As SB3's ``load``, with the same parameters, and ``trust``. If the model has a seed (and no other is given), the random
         generators are restored: a run that was saved after ``learn``, or between two rollouts, is resumed exactly (pass
         ``force_reset=False`` and an environment in the same state). SB3's CheckpointCallback saves in the middle of a step.
 
-        :raises ValueError: if the file is truncated, or was saved by another class
+        :param trust: whether Python objects in the file are loaded, which runs whatever code they name; needed for files with
+            classes of your own in ``policy_kwargs``, and for those of SB3's own ``save``
+        :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
+        :raises TypeError: for a keyword that is no argument of the agent
         """
+        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.__init__).parameters][3:])
         if isinstance(path, (str, pathlib.Path)):
             found = find_file(path)
             if found is not None and not is_whole_model(found):
@@ -127,42 +172,72 @@ class SafeFiles(OffPolicyAlgorithm):
                     f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or something else. "
                     "Load an earlier checkpoint."
                 )
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        given = custom_objects or {}
+        data = {name: value for name, value in read_data(path).items() if name not in given}
+        objects = {**decode_data(path, data, trust), **given}  # in place of SB3's unpickling
+        model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
         if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
         return model
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """As SB3's ``save_replay_buffer``; the file is written beside and renamed."""
+        """As SB3's ``save_replay_buffer``, as arrays and plain data; the file is written beside and renamed."""
+        assert self.replay_buffer is not None
+        notes = {"algorithm": type(self).__name__, "num_timesteps": self.num_timesteps}
         if not isinstance(path, (str, pathlib.Path)):
-            super().save_replay_buffer(path)
+            write_buffer(path, self.replay_buffer, notes)  # type: ignore[arg-type]
             return
-        with atomic_write(path, "pkl") as file:
-            super().save_replay_buffer(file)  # type: ignore[arg-type]
+        with atomic_write(path, "pkl") as file:  # SB3's ending, which scripts expect
+            write_buffer(file, self.replay_buffer, notes)
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, trust: bool = False
+    ) -> None:
         """
         As SB3's ``load_replay_buffer``; ``truncate_last_traj`` has no effect here.
 
-        :raises ValueError: if the file is truncated, or holds a buffer of another kind, or for other spaces or environments;
-            the model then keeps the buffer it had
+        :param trust: whether a pickle, as SB3 writes it, is loaded, which runs whatever code it names
+        :raises ValueError: if the file is truncated or changed, needs ``trust``, or holds a buffer of another kind or
+            algorithm, or for other spaces or environments; the model then keeps the buffer it had
         """
         before = self.replay_buffer
         assert before is not None
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-        except (EOFError, pickle.UnpicklingError, AssertionError) as error:
-            self.replay_buffer = before
-            raise ValueError(
-                f"{path}: expected a whole replay buffer saved by {type(self).__name__}.save_replay_buffer, "
-                f"found one that is cut off or something else ({error}). Load an earlier one."
-            ) from error
-        loaded, self.replay_buffer = self.replay_buffer, before
-        expected, found = _describe(before), _describe(loaded)
+        loaded, notes = self._read_replay_buffer(path, trust)
+        expected = {"algorithm": type(self).__name__, **_describe(before)}
+        found = {"algorithm": type(self).__name__, **notes, **_describe(loaded)}
+        steps = found.pop("num_timesteps", self.num_timesteps)
         if expected != found:
             raise ValueError(f"{path}: expected a replay buffer of {expected}, found {found}. Load the one of this model.")
+        if steps != self.num_timesteps:
+            warnings.warn(
+                f"{path}: this replay buffer was saved at step {steps}, and the model is of step {self.num_timesteps}. "
+                "Load files that were saved together."
+            )
+        loaded.device = before.device
         self.replay_buffer = loaded
+
+    def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:
+        before = self.replay_buffer
+        file = open_path(path, "r", verbose=self.verbose, suffix="pkl")
+        try:
+            is_ours = zipfile.is_zipfile(file)
+            file.seek(0)
+            if is_ours:
+                return read_buffer(file, before)  # type: ignore[arg-type]
+            if not trust:
+                raise ValueError("it is truncated, or a pickle, whose loading runs code: pass trust=True for one of yours")
+            super().load_replay_buffer(file)  # type: ignore[arg-type]
+            return self.replay_buffer, {}
+        except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:
+            raise ValueError(
+                f"{path}: expected a complete replay buffer saved by {type(self).__name__}.save_replay_buffer, "
+                f"found something else ({error}). Load an earlier one."
+            ) from error
+        finally:
+            self.replay_buffer = before
+            if isinstance(path, (str, pathlib.Path)):
+                file.close()
 
 
 def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.save_util import find_file, is_whole_model, read_description
+from sb3_eqr.common.save_util import find_file, is_whole_model, read_data
 from sb3_eqr.common.validation import check_same_parameters
 
 ENCODER = "features_extractor"
@@ -26,7 +26,7 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
     :raises ValueError: if the file holds no EqR agent, or one of another group, trunk or number of actions
     """
     found = _saved_parts(path, policy.device)
-    check_same_parameters({"group": policy.description["group"]}, read_description(path))
+    check_same_parameters({"group": policy.description["group"]}, read_data(path).get("policy_description", {}))
     modules = representation(policy)
     for name, module in modules.items():
         expected = {key: f"of shape {tuple(value.shape)}" for key, value in module.state_dict().items()}

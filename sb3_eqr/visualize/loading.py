@@ -39,7 +39,7 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
 
 def find_algorithm(path: pathlib.Path) -> str:
     """
-    By the module of the policy's class, which SB3 writes in plain text: nothing is unpickled.
+    By the module of the policy's class, which is plain text: nothing is unpickled.
 
     :param path: of a whole file
     :return: one of ``AGENTS``
@@ -47,7 +47,8 @@ def find_algorithm(path: pathlib.Path) -> str:
     """
     with zipfile.ZipFile(path) as archive:
         data = json.loads(archive.read("data"))
-    module = str(data.get("policy_class", {}).get("__module__"))
+    saved = data.get("policy_class", {})
+    module = str(saved.get("module", saved.get("__module__")))
     for name in AGENTS:
         if module.startswith(f"sb3_eqr.{name}."):
             return name

@@ -1,8 +1,14 @@
 """Saving, loading, going on, and files that are not what they should be."""
 
+import base64
 import io
+import json
+import pathlib
+import pickle
 import subprocess
 import sys
+import warnings
+import zipfile
 from copy import deepcopy
 
 import numpy as np
@@ -207,8 +213,8 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, 
     model.learn(160, callback=Save(tmp_path, at=80))
     command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "80"]
     subprocess.run(command, check=True, timeout=120)
-    continued = make.algorithm.load(tmp_path / "continued", device="cpu")
-    halfway = make.algorithm.load(tmp_path / "model", device="cpu")
+    continued = make.algorithm.load(tmp_path / "continued", device="cpu", trust=True)
+    halfway = make.algorithm.load(tmp_path / "model", device="cpu", trust=True)
     assert continued.num_timesteps == 160 and continued._n_updates == model._n_updates
     assert continued._resets.done == model._resets.done == ([30, 60, 90] if knobs else [])
     assert halfway._resets.done == model._resets.done[:1]
@@ -225,6 +231,10 @@ def test_a_file_of_another_class(make, tmp_path):
     for algorithm in (QRDQN, DQN):
         algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
         with pytest.raises(ValueError, match=r"expected a policy derived from EqR(QRDQN|Rainbow)Policy, found .*QNPolicy"):
+            make.algorithm.load(tmp_path / "stock", env=ChainEnv(), trust=True)
+        with pytest.raises(
+            ValueError, match=r"stock: the file holds Python objects.*policy_class: \S+QNPolicy.*pass trust=True"
+        ):
             make.algorithm.load(tmp_path / "stock", env=ChainEnv())
 
 
@@ -274,9 +284,73 @@ def test_checkpoints_cut_off_halfway(make, share, tmp_path):
     with pytest.raises(ValueError, match="cut off"):
         make.algorithm.load(tmp_path / "model")
     buffer = model.replay_buffer
-    with pytest.raises(ValueError, match="cut off"):
+    with pytest.raises(ValueError, match="expected a complete replay buffer saved by"):
         model.load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer is buffer
+
+
+def test_a_flipped_byte_anywhere_is_seen(make, tmp_path):
+    model = make(ChainEnv()).learn(46)
+    model.save_replay_buffer(tmp_path / "buffer")
+    path, buffer = tmp_path / "buffer.pkl", model.replay_buffer
+    content = path.read_bytes()
+    rewards = buffer.rewards.tobytes()
+    assert rewards in content
+    for place in [content.index(rewards) + k for k in range(0, len(rewards), 37)]:
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        with pytest.raises(ValueError, match="Bad CRC-32"):
+            model.load_replay_buffer(path)
+    assert model.replay_buffer is buffer
+
+
+def test_a_buffer_of_another_step_is_warned_of(make, tmp_path):
+    model = make(ChainEnv()).learn(46)
+    model.save_replay_buffer(tmp_path / "buffer")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(4, reset_num_timesteps=False)
+    with pytest.warns(UserWarning, match="saved at step 46, and the model is of step 50"):
+        model.load_replay_buffer(tmp_path / "buffer")
+
+
+class Runs:
+    def __reduce__(self):
+        return pathlib.Path.touch, (pathlib.Path("ran"),)
+
+
+def test_loading_runs_nothing(make, tmp_path, monkeypatch):
+    """Pickles in the place of every file, and inside a model."""
+    monkeypatch.chdir(tmp_path)
+    model = make(ChainEnv()).learn(46)
+    model.save("model")
+    with zipfile.ZipFile("model.zip") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    evil = pickle.dumps(Runs())
+    data = json.loads(members["data"])
+    forged = {":serialized:": base64.b64encode(evil).decode()}
+    for name in ("policy_class", "verbose", "anything"):
+        with zipfile.ZipFile("forged.zip", "w") as archive:
+            for member, content in members.items():
+                archive.writestr(member, json.dumps({**data, name: forged}) if member == "data" else content)
+        for load in (make.algorithm.load, lambda path: make.algorithm.load(path, env=ChainEnv())):
+            with pytest.raises(ValueError, match="pass trust=True"):
+                load("forged")
+        model.set_parameters("forged")  # reads no attributes
+    with zipfile.ZipFile("weights.zip", "w") as archive:
+        for member, content in members.items():
+            archive.writestr(member, evil if member == "policy.pth" else content)
+    for load in (make.algorithm.load, model.set_parameters, model.load_representation):
+        with pytest.raises(Exception, match=r"weights_only|Weights only"):
+            load("weights")
+    pathlib.Path("buffer.pkl").write_bytes(evil)
+    with pytest.raises(ValueError, match="pass trust=True"):
+        model.load_replay_buffer("buffer")
+    with open("buffer.pkl", "wb") as file:
+        np.savez(file, data=np.array([Runs()], dtype=object))
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        model.load_replay_buffer("buffer")
+    assert not pathlib.Path("ran").exists()
 
 
 def test_replay_buffers_of_others(make, tmp_path):
@@ -285,13 +359,15 @@ def test_replay_buffers_of_others(make, tmp_path):
     stock.save_replay_buffer(tmp_path / "stock")
     images = make(ImageEnv(), "CnnPolicy")
     images.save_replay_buffer(tmp_path / "images")
-    for name in ("stock", "images"):
-        with pytest.raises(ValueError, match="expected a replay buffer of"):
-            model.load_replay_buffer(tmp_path / name)
+    other_kind = EqRRainbow if make.algorithm is EqRQRDQN else EqRQRDQN
+    other_kind("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "relative")
+    for name in ("stock", "images", "relative"):
+        with pytest.raises(ValueError, match=r"expected a (complete )?replay buffer"):
+            model.load_replay_buffer(tmp_path / name, trust=True)
         assert model.replay_buffer.size() == 46
     for other in ({"prioritized_replay": False}, {"replay_buffer_kwargs": {"alpha": 0.9}}):
         make(ChainEnv(), **other).save_replay_buffer(tmp_path / "other")
-        with pytest.raises(ValueError, match="expected a replay buffer of"):
+        with pytest.raises(ValueError, match=r"expected a (complete )?replay buffer"):
             model.load_replay_buffer(tmp_path / "other")
 
 

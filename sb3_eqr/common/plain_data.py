@@ -1,0 +1,235 @@
+"""
+Python values as JSON and back, without executing anything: numbers, strings, containers, arrays, spaces, schedules, and
+classes of the packages that an agent is made of. What only a pickle can hold becomes one, and is read where it is trusted.
+"""
+
+import base64
+import enum
+import importlib
+import io
+import pickle
+import pickletools
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
+from types import FunctionType
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from torch import nn
+
+KIND = ":kind:"  # marks what JSON has no form for
+PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_eqr")  # whose classes are found by name
+CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # and are derived from one of these
+# Classes whose objects are their attributes and nothing else.
+OBJECTS = {
+    "stable_baselines3.common.utils": ("FloatSchedule", "LinearSchedule", "ConstantSchedule"),
+    "stable_baselines3.common.type_aliases": ("TrainFreq", "TrainFrequencyUnit"),
+    "rl_zoo3.utils": ("SimpleLinearSchedule",),
+    "sb3_eqr.common.resets": ("ResetSchedule", "Resets"),
+    "sb3_eqr.common.groups.matrix": ("GL", "SE", "SO", "T", "NoGroup", "MatrixLieGroup"),
+    "sb3_eqr.common.groups.product": ("ProductGroup",),
+}
+SPACES = {"Box": ("low", "high", "shape", "dtype"), "Discrete": ("n", "start"), "MultiDiscrete": ("nvec",)}
+SPACES |= {"MultiBinary": ("n",), "Dict": ("spaces",), "Tuple": ("spaces",)}
+
+
+class UntrustedError(ValueError):
+    """A file holds pickles, whose loading runs what they name. ``names``: what that is."""
+
+    def __init__(self, names: list[str]):
+        super().__init__(", ".join(names))
+        self.names = names
+
+
+def encode(value: Any) -> Any:
+    """A value as JSON; what is not in this module's lists as a pickle inside it."""
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    for encoder in (_encode_container, _encode_array, _encode_space, _encode_known):
+        found = encoder(value)
+        if found is not None:
+            return found
+    return {KIND: "pickle", "type": str(type(value)), "pickle": base64.b64encode(cloudpickle.dumps(value)).decode()}
+
+
+def _encode_container(value: Any) -> Any:
+    if type(value) is list:
+        return [encode(item) for item in value]
+    if type(value) in (dict, OrderedDict):
+        if all(isinstance(key, str) for key in value) and KIND not in value:
+            return {key: encode(item) for key, item in value.items()}
+        return {KIND: "dict", "items": [[encode(key), encode(item)] for key, item in value.items()]}
+    if type(value) is tuple:
+        return {KIND: "tuple", "items": [encode(item) for item in value]}
+    if type(value) is deque:
+        return {KIND: "deque", "items": [encode(item) for item in value], "maxlen": value.maxlen}
+    return None
+
+
+def _encode_array(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
+        file = io.BytesIO()
+        np.save(file, value, allow_pickle=False)
+        return {KIND: "array", "is_scalar": isinstance(value, np.generic), "npy": base64.b64encode(file.getvalue()).decode()}
+    if isinstance(value, th.dtype):
+        return {KIND: "dtype", "name": str(value).removeprefix("torch.")}
+    if isinstance(value, th.device):
+        return {KIND: "device", "name": str(value)}
+    if type(value) is th.Tensor:
+        return {KIND: "tensor", "array": encode(value.detach().cpu().numpy())}
+    return None
+
+
+def _encode_space(space: Any) -> Any:
+    name = type(space).__name__
+    if name not in SPACES or type(space) is not getattr(spaces, name):
+        return None
+    arguments = {key: getattr(space, key) for key in SPACES[name]}
+    if name == "Dict":
+        arguments["spaces"] = dict(arguments["spaces"])
+    if "dtype" in arguments:
+        arguments["dtype"] = np.dtype(arguments["dtype"]).str
+    return {KIND: "space", "name": name, "arguments": encode(arguments)}
+
+
+def _encode_known(value: Any) -> Any:
+    if isinstance(value, (type, FunctionType)):
+        name = {"module": value.__module__, "name": value.__qualname__}
+        return {KIND: "class", **name} if _is_legal(value) else None
+    kind = type(value)
+    if kind.__name__ not in OBJECTS.get(kind.__module__, ()):
+        return None
+    name = {"module": kind.__module__, "name": kind.__name__}
+    if isinstance(value, enum.Enum):
+        return {KIND: "enum", **name, "value": encode(value.value)}
+    if isinstance(value, tuple):
+        return {KIND: "named tuple", **name, "items": [encode(item) for item in value]}
+    return {KIND: "object", **name, "attributes": {key: encode(item) for key, item in vars(value).items()}}
+
+
+def decode(value: Any, trust: bool = False) -> Any:
+    """
+    The way back.
+
+    :param value: JSON of :func:`encode`
+    :param trust: whether pickles in it are loaded, which runs what they name
+    :raises UntrustedError: for a pickle without ``trust``
+    :raises ValueError: for what :func:`encode` does not make
+    """
+    if isinstance(value, list):
+        return [decode(item, trust) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    if ":serialized:" in value:  # SB3's own form
+        return _decode_pickle({"pickle": value[":serialized:"]}, trust)
+    if KIND not in value:
+        return {key: decode(item, trust) for key, item in value.items()}
+    if value[KIND] not in DECODERS:
+        raise ValueError(f"data must be what save() writes, got {KIND} {value[KIND]!r}")
+    return DECODERS[value[KIND]](value, trust)
+
+
+def _decode_array(value: Mapping[str, Any], trust: bool) -> Any:
+    array = np.load(io.BytesIO(base64.b64decode(value["npy"])), allow_pickle=False)
+    return array[()] if value["is_scalar"] else array
+
+
+def _decode_dtype(value: Mapping[str, Any], trust: bool) -> th.dtype:
+    found = getattr(th, value["name"])
+    if not isinstance(found, th.dtype):
+        raise ValueError(f"data must name a dtype of torch, got {value['name']!r}")
+    return found
+
+
+def _decode_space(value: Mapping[str, Any], trust: bool) -> spaces.Space:
+    if value["name"] not in SPACES:
+        raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {value['name']!r}")
+    return getattr(spaces, value["name"])(**decode(value["arguments"], trust))
+
+
+def _decode_class(value: Mapping[str, Any], trust: bool) -> Any:
+    found = _find(value["module"], value["name"])
+    if not _is_legal(found):
+        raise ValueError(f"data must name a class that agents are made of, got {value['module']}.{value['name']}")
+    return found
+
+
+def _decode_object(value: Mapping[str, Any], trust: bool) -> Any:
+    if value["name"] not in OBJECTS.get(value["module"], ()):
+        raise ValueError(f"data must be objects of {sorted(OBJECTS)}, got {value['module']}.{value['name']}")
+    found: Any = _find(value["module"], value["name"])
+    if value[KIND] == "enum":
+        return found(decode(value["value"], trust))
+    if value[KIND] == "named tuple":
+        return found(*[decode(item, trust) for item in value["items"]])
+    attributes = decode(value["attributes"], trust)
+    made = object.__new__(found)
+    vars(made).update(attributes)
+    check = getattr(found, "__post_init__", None)
+    if check is not None:
+        check(made)
+    return made
+
+
+def _decode_pickle(value: Mapping[str, Any], trust: bool) -> Any:
+    content = base64.b64decode(value["pickle"])
+    if not trust:
+        raise UntrustedError(names_in(content))
+    return cloudpickle.loads(content)
+
+
+DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
+    "dict": lambda value, trust: {decode(key, trust): decode(item, trust) for key, item in value["items"]},
+    "tuple": lambda value, trust: tuple(decode(value["items"], trust)),
+    "deque": lambda value, trust: deque(decode(value["items"], trust), value["maxlen"]),
+    "array": _decode_array,
+    "dtype": _decode_dtype,
+    "device": lambda value, trust: th.device(value["name"]),
+    "tensor": lambda value, trust: th.from_numpy(np.ascontiguousarray(decode(value["array"], trust))),
+    "space": _decode_space,
+    "class": _decode_class,
+    "object": _decode_object,
+    "named tuple": _decode_object,
+    "enum": _decode_object,
+    "pickle": _decode_pickle,
+}
+
+
+def _find(module: str, name: str) -> Any:
+    if module.split(".")[0] not in PACKAGES and module not in OBJECTS:
+        raise ValueError(f"data must name classes of {', '.join(PACKAGES)}, got {module}.{name}")
+    found: Any = importlib.import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def _is_legal(value: Any) -> bool:
+    """A class that agents are made of, or a function of the groups' mathematics; under its name in its module."""
+    if isinstance(value, type):
+        legal = issubclass(value, CLASSES) and str(value.__module__).split(".")[0] in PACKAGES
+    else:
+        legal = isinstance(value, FunctionType) and str(value.__module__).startswith("sb3_eqr.common.groups.")
+    return legal and "<locals>" not in value.__qualname__ and "<lambda>" not in value.__qualname__
+
+
+def names_in(content: bytes) -> list[str]:
+    """What a pickle would import, and so may run, found without loading it."""
+    names: list[str] = []
+    strings: list[str] = []
+    try:
+        for code, argument, _ in pickletools.genops(content):
+            if code.name in ("GLOBAL", "INST"):
+                names.append(str(argument).replace(" ", "."))
+            elif code.name == "STACK_GLOBAL" and len(strings) >= 2:
+                names.append(".".join(strings[-2:]))
+            if isinstance(argument, str):
+                strings.append(argument)
+    except (ValueError, pickle.UnpicklingError):
+        names.append("(what cannot be read)")
+    return sorted(set(names))
