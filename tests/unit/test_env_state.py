@@ -1,0 +1,86 @@
+"""The state of an environment, taken from one and put into another that was built alike: both then do the same."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+from sb3_eqr import envs
+from sb3_eqr.common.env_state import capture, restore
+from sb3_eqr.envs.minatar import ChannelsFirstImage
+from tests.toys import ChainEnv, ImageEnv
+
+envs.register()
+
+
+def atari(seed):
+    pytest.importorskip("ale_py")
+    return envs.make_atari100k_env("Pong", n_envs=2, seed=seed)
+
+
+def minatar(seed):
+    pytest.importorskip("minatar")
+    return VecFrameStack(make_vec_env("MinAtar/SpaceInvaders-v1", 2, seed, wrapper_class=ChannelsFirstImage), 2)
+
+
+WORLDS = {
+    "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 3, seed)),
+    "acrobot": lambda seed: make_vec_env("Acrobot-v1", 2, seed),
+    "lake": lambda seed: make_vec_env("FrozenLake-v1", 2, seed),
+    "chain": lambda seed: make_vec_env(ChainEnv, 2, seed),
+    "images": lambda seed: VecFrameStack(make_vec_env(ImageEnv, 2, seed), 4),
+    "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs={"goal": [0.5, 0.5]}),
+    "pendulum": lambda seed: make_vec_env("PixelPendulum-v0", 2, seed),
+    "minatar": minatar,
+    "atari": atari,
+}
+
+
+def play(env, actions):
+    seen = []
+    for action in actions:
+        observations, rewards, dones, infos = env.step(action)
+        infos = [{key: value for key, value in info.items() if key != "episode"} for info in infos]  # wall-clock time in it
+        seen.append((observations.copy(), rewards.copy(), dones.copy(), [sorted(info) for info in infos]))
+    return seen
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_both_do_the_same_from_then_on(name):
+    first, second = WORLDS[name](0), WORLDS[name](7)
+    rng = np.random.default_rng(0)
+    actions = rng.integers(first.action_space.n, size=(90, first.num_envs))
+    first.reset()
+    second.reset()
+    play(first, actions[:37])
+    play(second, actions[50:61])
+    state, hidden = capture(first)
+    assert not hidden
+    text = json.dumps(state)
+    assert '": "pickle"' not in text
+    restore(second, json.loads(text))
+    for (a, b, c, d), (e, f, g, h) in zip(play(first, actions[37:]), play(second, actions[37:]), strict=True):
+        assert np.array_equal(a, e) and np.array_equal(b, f) and np.array_equal(c, g) and d == h
+
+
+def test_what_cannot_be_seen_is_named():
+    pytest.importorskip("Box2D")
+    env = make_vec_env("LunarLander-v3", 1)
+    env.reset()
+    _, hidden = capture(env)
+    assert any("world" in path for path in hidden)
+
+
+def test_another_environment_is_refused():
+    first, second = (
+        make_vec_env("CartPole-v1", 1),
+        make_vec_env("CartPole-v1", 1, wrapper_class=gym.wrappers.FlattenObservation),
+    )
+    first.reset()
+    second.reset()
+    state, _ = capture(second)
+    with pytest.raises(ValueError, match="must be built as the one whose state this is"):
+        restore(first, state)
