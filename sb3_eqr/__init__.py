@@ -1,5 +1,6 @@
 """EqR: equivariant representations for data-efficient reinforcement learning, on Stable-Baselines3."""
 
+from sb3_eqr.common.checkpoints import ExactCheckpointCallback
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
 from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
@@ -14,6 +15,7 @@ AGENTS = {"eqr_qrdqn": EqRQRDQN, "eqr_rainbow": EqRRainbow}  # by their names in
 __all__ = [
     "EqRQRDQN",
     "EqRRainbow",
+    "ExactCheckpointCallback",
     "GroupFeaturesExtractor",
     "MatrixLieGroup",
     "PrioritizedSequenceReplayBuffer",

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import is_wrapped, make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
-from sb3_eqr.common.save_util import get_rng_state, set_rng_state
+from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.envs.atari_batch import AtariBatch, has_atari_batch
 
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation plays other games than training, and than that of another seed

@@ -5,23 +5,22 @@ import io
 import json
 import pathlib
 import pickle
-import random
 import warnings
 import zipfile
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import open_path, recursive_getattr, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_eqr.common.checkpoints import BUFFER, MODEL, read_manifest, restore_environment, restore_generators, warn_of_hidden
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.plain_data import UntrustedError, decode, encode
+from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.replay.buffer_files import read_buffer, write_buffer
 from sb3_eqr.common.validation import check_names
 
@@ -82,27 +81,6 @@ def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
     """A model's file by its path, whose ending may be left out."""
     return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
-
-
-def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
-    """The state of all generators that training draws from; SB3 draws random actions from that of the action space."""
-    return {
-        "python": random.getstate(),
-        "numpy": np.random.get_state(),
-        "torch": th.get_rng_state(),
-        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
-        "action_space": action_space.np_random.bit_generator.state,
-    }
-
-
-def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
-    """The way back to a state of :func:`get_rng_state`."""
-    random.setstate(state["python"])
-    np.random.set_state(state["numpy"])
-    th.set_rng_state(state["torch"])
-    if len(state["cuda"]) == th.cuda.device_count():
-        th.cuda.set_rng_state_all(state["cuda"])
-    action_space.np_random.bit_generator.state = state["action_space"]
 
 
 class SafeFiles(OffPolicyAlgorithm):
@@ -179,6 +157,36 @@ class SafeFiles(OffPolicyAlgorithm):
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
         if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
+        return model
+
+    @classmethod
+    def resume(
+        cls: type[SelfSafeFiles],
+        path: str | pathlib.Path,
+        env: GymEnv,
+        device: th.device | str = "auto",
+        trust: bool = False,
+    ) -> SelfSafeFiles:
+        """
+        Continue where a checkpoint of :class:`~sb3_eqr.common.checkpoints.ExactCheckpointCallback` was written, bit for bit as
+        if the run had not stopped: ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
+
+        :param path: the checkpoint, or the folder of checkpoints, whose last one is taken
+        :param env: built as for the run, VecNormalize included
+        :param device: as in ``load``
+        :param trust: likewise
+        :raises ValueError: if there is no complete checkpoint, or a file in it has changed
+        """
+        checkpoint, manifest = read_manifest(pathlib.Path(path))
+        is_exact = not manifest["hidden"]
+        if not is_exact:
+            warn_of_hidden(checkpoint, manifest)
+        model = cls.load(checkpoint / MODEL, env, device, force_reset=not is_exact, trust=trust)
+        if (checkpoint / BUFFER).is_file():
+            model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
+        assert model.env is not None
+        restore_environment(model.env, checkpoint, wrappers_only=not is_exact)
+        restore_generators(model, manifest)
         return model
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:

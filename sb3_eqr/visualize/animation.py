@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.groups import NoGroup
-from sb3_eqr.common.save_util import get_rng_state, set_rng_state
+from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter

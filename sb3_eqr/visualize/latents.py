@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.latent_model import GroupLatentModel
+from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
-from sb3_eqr.common.save_util import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.validation import check_number
 

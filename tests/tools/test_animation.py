@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.save_util import get_rng_state
+from sb3_eqr.common.random_state import get_rng_state
 from sb3_eqr.visualize import animation
 from sb3_eqr.visualize.animation import predictions, record, shoot
 from sb3_eqr.visualize.callback import LatentCallback

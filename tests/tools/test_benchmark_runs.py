@@ -13,11 +13,12 @@ from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr.benchmark import evaluation, recording
 from sb3_eqr.benchmark.agents import Agent, find_agent
-from sb3_eqr.benchmark.checkpoints import find_checkpoints, pickle_environment, restore_environment
+from sb3_eqr.benchmark.checkpoints import find_checkpoints
 from sb3_eqr.benchmark.evaluation import EpsilonGreedy, GamesInTurn, evaluate, fits_atari_batch, make_evaluation_env
 from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.benchmark.training import execute
+from sb3_eqr.common.env_state import capture, restore
 from sb3_eqr.envs import atari, atari_batch, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 
@@ -358,7 +359,7 @@ def test_atari_is_evaluated_without_a_batch_where_ale_has_none(monkeypatch):
     assert evaluate(Fixed(), atari_protocol("Breakout"), 4, seed=0)[1] == [40] * 4
 
 
-def test_atari_games_are_pickled_as_they_stand():
+def test_atari_games_are_saved_as_they_stand():
     """Stacked frames, lives, no-ops to come: a copy from a checkpoint plays on as the game itself does."""
     make = lambda: VecFrameStack(make_vec_env("BreakoutNoFrameskip-v4", 1, seed=1, wrapper_class=Atari100kWrapper), 4)  # noqa: E731
     env, copied = make(), make()
@@ -366,9 +367,10 @@ def test_atari_games_are_pickled_as_they_stand():
     env.reset()
     for _ in range(200):
         env.step(rng.integers(0, env.action_space.n, 1))
-    states = pickle_environment(env)
-    assert None not in states
-    restore_environment(copied, states)
+    state, hidden = capture(env)
+    assert not hidden
+    copied.reset()
+    restore(copied, json.loads(json.dumps(state)))
     lives = []
     for _ in range(70):
         actions = rng.integers(0, env.action_space.n, 1)
@@ -380,7 +382,7 @@ def test_atari_games_are_pickled_as_they_stand():
 
 
 def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
-    """LunarLander cannot be pickled in the middle of an episode."""
+    """LunarLander cannot be saved in the middle of an episode."""
     run = make_run(tmp_path, "dqn", game="LunarLander-v3", steps=300)
     stop_at(monkeypatch, 100)
     with pytest.raises(KeyError):

@@ -1,0 +1,29 @@
+"""The state of all random generators that training draws from."""
+
+import random
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+
+def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
+    """The state of all generators that training draws from; SB3 draws random actions from that of the action space."""
+    return {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(),
+        "torch": th.get_rng_state(),
+        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+        "action_space": action_space.np_random.bit_generator.state,
+    }
+
+
+def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
+    """The way back to a state of :func:`get_rng_state`."""
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])
+    th.set_rng_state(state["torch"])
+    if len(state["cuda"]) == th.cuda.device_count():
+        th.cuda.set_rng_state_all(state["cuda"])
+    action_space.np_random.bit_generator.state = state["action_space"]

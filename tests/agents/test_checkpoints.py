@@ -1,0 +1,115 @@
+"""Checkpoints: a run that was stopped anywhere and resumed is the run that was not."""
+
+import subprocess
+import sys
+
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+import sb3_eqr
+from sb3_eqr import EqRQRDQN, EqRRainbow, envs
+from sb3_eqr.common.checkpoints import ExactCheckpointCallback, write_checkpoint
+from sb3_eqr.envs.minatar import ChannelsFirstImage
+from tests.toys import ChainEnv
+
+envs.register()
+STEPS = 160
+SMALL = {"buffer_size": 300, "batch_size": 8, "learning_starts": 40, "n_steps": 3, "seed": 3, "device": "cpu"}
+SMALL["policy_kwargs"] = {"net_arch": [8], "n_blocks": 2, "latent_hidden_dim": 8}
+MINATAR = {"policy_kwargs": {**SMALL["policy_kwargs"], "features_extractor_kwargs": {"layers": [[4, 3, 1]]}}}
+
+
+def minatar():
+    pytest.importorskip("minatar")
+    return VecFrameStack(make_vec_env("MinAtar/Breakout-v1", 1, wrapper_class=ChannelsFirstImage), 2)
+
+
+WORLDS = {
+    "EqRQRDQN": (lambda: VecNormalize(make_vec_env("CartPole-v1", 2)), "MlpPolicy", {"gradient_steps": 2, "train_freq": 3}),
+    "EqRRainbow": (minatar, "CnnPolicy", {**MINATAR, "train_freq": 4, "v": None}),
+}
+WORLDS["EqRRainbow"][2].pop("v")
+
+
+def resume(algorithm, folder):
+    """In another process: continue from the last checkpoint, save."""
+    th.set_num_threads(1)
+    env, *_ = WORLDS[algorithm]
+    model = getattr(sb3_eqr, algorithm).resume(folder, env())
+    callback = ExactCheckpointCallback(30, folder)
+    model.learn(STEPS - model.num_timesteps, callback, reset_num_timesteps=False).save(f"{folder}/resumed")
+
+
+@pytest.mark.parametrize("algorithm", WORLDS)
+def test_resumed_in_a_new_process_to_the_last_bit(algorithm, tmp_path):
+    kind = getattr(sb3_eqr, algorithm)
+    env, policy, settings = WORLDS[algorithm]
+    whole = kind(policy, env(), **{**SMALL, **settings}).learn(STEPS)
+    stopped = kind(policy, env(), **{**SMALL, **settings})
+    stopped.learn(STEPS, ExactCheckpointCallback(30, tmp_path, keep=3))
+    found = sorted(path.name for path in tmp_path.iterdir())
+    assert len(found) == 3 and all(name.startswith("checkpoint-0000000001") for name in found[1:])
+    for later in found[1:]:  # as if it had been killed after the first of them
+        for file in (tmp_path / later).iterdir():
+            file.unlink()
+        (tmp_path / later).rmdir()
+    command = f"from tests.agents.test_checkpoints import resume; resume({algorithm!r}, {str(tmp_path)!r})"
+    subprocess.run([sys.executable, "-c", command], check=True)
+    resumed = kind.load(tmp_path / "resumed")
+    for model in (stopped, resumed):
+        assert model.num_timesteps == whole.num_timesteps and model._n_updates == whole._n_updates > 20
+        mine, other = model.policy.state_dict(), whole.policy.state_dict()
+        assert all(th.equal(mine[key], other[key]) for key in other)
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, tmp_path, keep=1))
+    (found,) = tmp_path.iterdir()
+    return found
+
+
+@pytest.mark.parametrize("name", ["model.zip", "replay_buffer.pkl", "environment.json", "manifest.json"])
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+def test_a_changed_file_is_named_and_refused(checkpoint, name, damage):
+    path = checkpoint / name
+    content = path.read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        half = len(content) // 2
+        path.write_bytes(
+            content[:half] if damage == "truncated" else content[:half] + bytes([content[half] ^ 1]) + content[half + 1 :]
+        )
+    with pytest.raises(ValueError, match=r"must be (as it was written|a complete checkpoint|a checkpoint or a folder)"):
+        EqRQRDQN.resume(checkpoint, ChainEnv())
+
+
+def test_the_last_complete_checkpoint_is_taken(checkpoint):
+    (checkpoint.parent / "checkpoint-000000000999").mkdir()  # of somebody else
+    assert EqRQRDQN.resume(checkpoint.parent, ChainEnv()).num_timesteps == int(checkpoint.name.partition("-")[2])
+    with pytest.raises(ValueError, match="got nothing"):
+        EqRQRDQN.resume(checkpoint.parent / "none", ChainEnv())
+    with pytest.raises(ValueError, match="expected a policy derived from EqRRainbowPolicy"):
+        EqRRainbow.resume(checkpoint, ChainEnv())
+
+
+def test_a_state_that_cannot_be_seen_is_warned_of(tmp_path):
+    pytest.importorskip("Box2D")
+    env = VecNormalize(make_vec_env("LunarLander-v3", 1))
+    EqRQRDQN("MlpPolicy", env, **SMALL).learn(60, ExactCheckpointCallback(60, tmp_path))
+    env.obs_rms.mean[:] = 7.0
+    write_checkpoint(tmp_path / "by hand", EqRQRDQN("MlpPolicy", env, **SMALL))
+    with pytest.warns(UserWarning, match=r"cannot be saved \(.*world.*new episodes"):
+        model = EqRQRDQN.resume(tmp_path / "by hand", VecNormalize(make_vec_env("LunarLander-v3", 1)))
+    assert (model.get_vec_normalize_env().obs_rms.mean == 7.0).all()  # the statistics are not lost
+    model.learn(10, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("wrong", [{"save_freq": 0}, {"save_freq": 1.5}, {"keep": 0}])
+def test_callback_arguments(wrong, tmp_path):
+    with pytest.raises(ValueError, match=r"must be an integer >= 1, got"):
+        ExactCheckpointCallback(**{"save_freq": 10, "save_path": tmp_path, **wrong})
