@@ -34,7 +34,7 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 import sb3_eqr.envs.atari
 import sb3_eqr.zoo.__main__ as zoo_command
 import sb3_eqr.zoo.hub
-from sb3_eqr import cli
+from sb3_eqr import ExactCheckpointCallback, cli
 from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.benchmark.suites import choose, load_suite, make_suite
 from sb3_eqr.zoo.entries import check_entry
@@ -252,7 +252,12 @@ def shortened(monkeypatch, tmp_path):
     def evaluate_one(model, env, n_eval_episodes=10, **kwargs):
         return evaluate(model, env, n_eval_episodes=1, **kwargs)
 
-    setup_model = OnPolicyAlgorithm._setup_model
+    def check_often(self, *args, **kwargs):
+        begin(self, *args, **kwargs)
+        self.save_freq = min(self.save_freq, STEPS // 2)
+
+    setup_model, begin = OnPolicyAlgorithm._setup_model, ExactCheckpointCallback.__init__
+    monkeypatch.setattr(ExactCheckpointCallback, "__init__", check_often)
     monkeypatch.setattr(BaseAlgorithm, "_setup_learn", setup_short_learn)
     monkeypatch.setattr(OnPolicyAlgorithm, "_setup_model", set_up_short_rollouts)
     monkeypatch.setattr(stable_baselines3.common.evaluation, "evaluate_policy", evaluate_one)
