@@ -116,10 +116,16 @@ def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
 
 
+def mean_and_error(values: list[float]) -> str:
+    """Mean ± standard error, which one value has not."""
+    error = f" ± {np.std(values, ddof=1) / np.sqrt(len(values)):.2f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.2f}{error}" if values else ""
+
+
 def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
     """
-    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the mean
-    return of the last tenth of training.
+    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the same of
+    the mean return of the last tenth of training.
     """
     lines = [f"| trial, {steps:,} steps | seeds | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 3) + "|"]
     for name in names:
@@ -127,10 +133,8 @@ def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps:
         cells = []
         for game in games:
             found = [row for row in own if row["game"] == game]
-            scores = np.array([row["score"] for row in found])
-            error = np.std(scores, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else np.inf
-            training = np.mean([row["curve"][-1] for row in found if row["curve"]] or [np.nan])
-            cells.append(f"{scores.mean():.2f} ± {error:.2f}, {training:.2f}" if found else "")
+            measures = ([row["score"] for row in found], [row["curve"][-1] for row in found if row["curve"]])
+            cells.append(", ".join(map(mean_and_error, measures)) if found else "")
         if own:
             seeds = len({row["seed"] for row in own})
             lines.append(

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -19,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 from sb3_eqr.common import validation
 from sb3_eqr.common.arguments import ALGORITHM, POLICY, check, check_arguments, number
 from sb3_eqr.common.cuda_graph import CapturedGradients
+from sb3_eqr.common.finite_data import FiniteData
 from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
 from sb3_eqr.common.optimizers import set_adam_defaults
@@ -35,7 +35,7 @@ SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
 
 
-class EqRAlgorithm(SafeFiles):
+class EqRAlgorithm(FiniteData, SafeFiles):
     """
     Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, auxiliary losses beside the TD loss, one backward,
     one clip, one step, the target, the priorities. The head and its loss are those of the policy's networks.
@@ -278,30 +278,7 @@ class EqRAlgorithm(SafeFiles):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been set since
-        result = super()._setup_learn(*args, **kwargs)
-        validation.check_finite("observation", self._last_obs, self.num_timesteps)
-        return result
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
-        normalize, step = self._vec_normalize_env, self.num_timesteps
-        try:
-            validation.check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
-            validation.check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
-            for info in infos:
-                validation.check_finite("terminal observation", info.get("terminal_observation", 0), step)
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        except ValueError:
-            self._last_obs = None  # the environment has moved on: another call of learn must reset it
-            raise
+        return super()._setup_learn(*args, **kwargs)
 
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""

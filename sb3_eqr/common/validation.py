@@ -29,14 +29,21 @@ def check_number(name: str, value: Any, low: float, high: float = np.inf, whole:
 
 def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
     """Refuse values (``what`` they are) of the environment, after so many steps, of which one is NaN or infinite."""
+    found = find_infinite(values)
+    if found is not None:
+        raise ValueError(
+            f"step {step}: expected finite {what}s from the environment, found {found} in the {what}. "
+            "It was not stored and the model is as before. SB3's VecCheckNan shows which action led there."
+        )
+
+
+def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | None:
+    """The first NaN or infinity of an array, or with its key of a dictionary of arrays; ``None`` if there is none."""
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         array = np.asarray(array)
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise ValueError(
-                f"step {step}: expected finite {what}s from the environment, found {array[~np.isfinite(array)].flat[0]} "
-                f"in the {what}{f' {key!r}' if key else ''}. It was not stored and the model is as before. "
-                "Mend the environment; SB3's VecCheckNan tells which action led there."
-            )
+            return f"{array[~np.isfinite(array)].flat[0]}{f' of {key!r}' if key else ''}"
+    return None
 
 
 def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewhere: type) -> None:

@@ -10,7 +10,7 @@ from sb3_contrib.qrdqn.policies import QRDQNPolicy
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from tests.models import EITHER, SMALL, loss_terms
@@ -116,6 +116,27 @@ def test_bad_values_from_the_environment(make, where, what, value, normalize):
     model.learn(5, reset_num_timesteps=False)  # resets the environment: no transition spans the gap
     assert model.replay_buffer.timeouts[58].all() or model.replay_buffer.dones[58].all()
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("where", ["obs", "reward"])
+def test_a_refused_step_leaves_the_statistics_of_vec_normalize(make, where):
+    env = VecNormalize(DummyVecEnv([lambda: PoisonEnv(where, at=50)]))
+    model = make(env)
+    with pytest.raises(ValueError, match="step 50: expected finite"):
+        model.learn(60)
+    clean = VecNormalize(DummyVecEnv([lambda: PoisonEnv(where, at=1_000)]))
+    make(clean).learn(49)
+    for name in ("obs_rms", "ret_rms"):
+        found, expected = getattr(env, name), getattr(clean, name)
+        assert np.array_equal(found.mean, expected.mean) and np.array_equal(found.var, expected.var)
+        assert found.count == expected.count
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_observations_of_predict_must_be_finite(make, value):
+    model = make(ChainEnv())
+    with pytest.raises(ValueError, match=f"observation must be finite, got {value}"):
+        model.predict(np.array([0.0, value, 0.0], dtype=np.float32))
 
 
 def test_a_bad_first_observation_is_refused_before_the_first_step(make):

@@ -1,0 +1,87 @@
+"""What environments and users hand in must be finite, or nothing of it is stored, learned or normalised with."""
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_eqr.common.validation import check_finite, find_infinite
+
+STATISTICS = ("obs_rms", "ret_rms")  # of VecNormalize
+
+
+class FiniteData(OffPolicyAlgorithm):
+    """
+    Mixin: refuses observations, rewards and terminal observations that are NaN or infinite, in training and in ``predict``. A
+    refused step leaves the replay buffer and the statistics of VecNormalize as they were.
+    """
+
+    _statistics: dict[str, Any] | None = None  # of the last step that was accepted
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._setup_learn(*args, **kwargs)
+        check_finite("observation", self._last_obs, self.num_timesteps)
+        self._statistics = statistics_of(self._vec_normalize_env)
+        return result
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
+        normalize, step = self._vec_normalize_env, self.num_timesteps
+        try:
+            check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
+            check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
+            for info in infos:
+                check_finite("terminal observation", info.get("terminal_observation", 0), step)
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        except ValueError:
+            self._last_obs = None  # the environment has moved on: another call of learn must reset it
+            restore_statistics(normalize, self._statistics)
+            raise
+        self._statistics = statistics_of(normalize)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """As SB3's ``predict``, with the same parameters; raises ValueError for an observation that is not finite."""
+        found = find_infinite(observation)
+        if found is not None:
+            raise ValueError(f"observation must be finite, got {found}.")
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_statistics"]
+
+
+def statistics_of(normalize: VecNormalize | None) -> dict[str, Any] | None:
+    """Running means as they are; SB3 replaces their arrays and never changes them in place, so that no copy is needed."""
+    if normalize is None:
+        return None
+    return {name: {key: dict(vars(part)) for key, part in _parts(normalize, name).items()} for name in STATISTICS}
+
+
+def restore_statistics(normalize: VecNormalize | None, statistics: dict[str, Any] | None) -> None:
+    """The way back from what a refused step has done to running means."""
+    if normalize is None or statistics is None:
+        return
+    for name, saved in statistics.items():
+        for key, part in _parts(normalize, name).items():
+            vars(part).update(saved[key])
+
+
+def _parts(normalize: VecNormalize, name: str) -> dict[str, Any]:
+    found = getattr(normalize, name, None)
+    return found if isinstance(found, dict) else {} if found is None else {"": found}
