@@ -57,7 +57,7 @@ class FiniteData(OffPolicyAlgorithm):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """As SB3's ``predict``, with the same parameters; raises ValueError for an observation that is not finite."""
-        found = find_infinite(observation)
+        found = find_infinite(observation) if isinstance(observation, (np.ndarray, dict)) else None
         if found is not None:
             raise ValueError(f"observation must be finite, got {found}.")
         return super().predict(observation, state, episode_start, deterministic)

@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> None:
     try:
         played = play(model, env, args.steps, depth, args.deterministic, args.seed)
     except ValueError as error:
-        name, colon, message = str(error).partition(":")
-        raise ValueError(f"{FLAGS.get(name, name)}{colon}{message}") from error
+        name, space, message = str(error).partition(" ")
+        raise ValueError(f"{FLAGS.get(name, name)}{space}{message}") from error
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
     actions, factors = action_names(env, model.policy.latent_model.n_actions), factor_names(env)

@@ -381,7 +381,7 @@ def test_a_save_that_fails_leaves_the_old_file(make, tmp_path, monkeypatch):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(th, "save", break_off)
-    monkeypatch.setattr("pickle.dump", break_off)
+    monkeypatch.setattr(np, "savez", break_off)
     for save in (model.save, model.save_replay_buffer):
         with pytest.raises(OSError, match="No space"):
             save(tmp_path / ("model" if save == model.save else "buffer"))
