@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.monitor import ResultsWriter
 
 from sb3_eqr.common.plain_data import KIND, decode, encode
 
 # What stays as it was built: definitions, and ways out of the program.
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
-FIXED += (spaces.Space, np.dtype, io.IOBase, logging.Logger)
+FIXED += (spaces.Space, np.dtype, io.IOBase, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
 PLAIN = (bool, int, float, str, bytes, np.generic)
 

@@ -10,6 +10,7 @@ import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import StoreDict, get_model_path
 
+from sb3_eqr.common.checkpoints import read_manifest
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_algo, check_environment, check_machine, check_trained_agent, fail, nearest
@@ -39,6 +40,8 @@ EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas",
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
 
 Every command but the last two takes RL Zoo's arguments: sb3-eqr train --help
+train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's folder, and
+--resume FOLDER, which continues a run from its last one; --trust where its settings hold Python objects
 benchmark compares agents over games and seeds: sb3-eqr benchmark --help
 visualize shows what a saved agent has learned: sb3-eqr visualize --help
 push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
@@ -78,10 +81,18 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--load-best", action="store_true")
     parser.add_argument("--load-checkpoint")
     parser.add_argument("--load-last-checkpoint", action="store_true")
+    add_resuming(parser)
     try:
         return parser.parse_known_args(arguments)[0]
     except (NameError, SyntaxError) as error:
         fail(f"--hyperparams: expected key:value, the value in Python ('text' in quotes), found one that is not: {error}")
+
+
+def add_resuming(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``train`` that RL Zoo does not have."""
+    parser.add_argument("--checkpoint-every", type=int)
+    parser.add_argument("--resume", type=pathlib.Path)
+    parser.add_argument("--trust", action="store_true")
 
 
 def prepare_training(args: argparse.Namespace) -> str | None:
@@ -103,6 +114,30 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     check_entry(entry, algo, path)
     register(policy_kwargs=entry.get("policy_kwargs"))
     return path
+
+
+def without_resuming(arguments: list[str]) -> list[str]:
+    """What is left of a command line for RL Zoo's own parser."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    add_resuming(parser)
+    return parser.parse_known_args(arguments)[1]
+
+
+def prepare_resuming(args: argparse.Namespace) -> None:
+    """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and let RL Zoo do as they say."""
+    from sb3_eqr.zoo import resuming
+
+    is_asked = args.checkpoint_every is not None or args.resume is not None
+    if is_asked and args.algo not in AGENTS:
+        fail(f"--checkpoint-every and --resume: expected --algo {' or '.join(AGENTS)}, found {args.algo}.")
+    if args.checkpoint_every is not None and args.checkpoint_every < 1:
+        fail(f"--checkpoint-every: expected at least 1 step, found {args.checkpoint_every}.")
+    if args.resume is not None:
+        try:
+            read_manifest(resuming.checkpoints_of(args.resume))
+        except ValueError as error:
+            fail(f"--resume: {error}")
+    resuming.install(args.checkpoint_every, args.resume, args.trust)
 
 
 def check_trained(args: argparse.Namespace) -> None:
@@ -189,6 +224,8 @@ def main() -> None:
             check_algo(args.algo)
         if command == "train":
             path = prepare_training(args)
+            prepare_resuming(args)
+            arguments = without_resuming(arguments)
             if path != args.conf_file:
                 arguments = [*arguments, "--conf-file", str(path)]  # the last one counts
         elif command in LOADING and args.algo is not None:

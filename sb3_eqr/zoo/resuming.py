@@ -1,0 +1,70 @@
+"""Runs of ``sb3-eqr train`` that can be stopped: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
+
+import pathlib
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+from rl_zoo3 import train
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_eqr.common.checkpoints import ExactCheckpointCallback
+
+FOLDER = "checkpoints"  # in the folder of a run
+
+
+class ResumableExperiment(ExperimentManager):
+    """RL Zoo's experiment, which writes checkpoints or continues from one, in a folder of its own as with ``-i``."""
+
+    checkpoint_every: ClassVar[int | None] = None
+    resume: ClassVar[pathlib.Path | None] = None
+    trust: ClassVar[bool] = False
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.continue_training = self.continue_training or self.resume is not None
+
+    def create_callbacks(self) -> None:
+        """RL Zoo's, and one for the checkpoints."""
+        super().create_callbacks()
+        if self.checkpoint_every is not None:
+            folder = pathlib.Path(self.save_path) / FOLDER
+            self.callbacks.append(ExactCheckpointCallback(self.checkpoint_every, folder, verbose=self.verbose))
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.resume is None:
+            return super()._load_pretrained_agent(hyperparams, env)
+        model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
+        print(f"Resuming at step {model.num_timesteps}")
+        self.n_timesteps -= model.num_timesteps
+        return model
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """RL Zoo's, which counts steps from 0; a resumed run counts on."""
+        if self.resume is None:
+            super().learn(model)
+        elif self.n_timesteps > 0:
+            counting_on = partial(model.learn, reset_num_timesteps=False)
+            super().learn(SimpleNamespace(learn=counting_on, env=model.env))  # type: ignore[arg-type]
+
+
+def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
+    """The checkpoints of a run's folder; any other path is one of checkpoints."""
+    return path / FOLDER if (path / FOLDER).is_dir() else path
+
+
+def install(checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool) -> None:
+    """
+    Let ``rl_zoo3.train`` make such experiments. Its parser knows no other arguments than its own, hence the attributes.
+
+    :param checkpoint_every: steps between two checkpoints; ``None``: none are written
+    :param resume: a run's folder, or one of checkpoints
+    :param trust: as in ``load``
+    """
+    ResumableExperiment.checkpoint_every = checkpoint_every
+    ResumableExperiment.resume = resume
+    ResumableExperiment.trust = trust
+    train.ExperimentManager = ResumableExperiment  # type: ignore[misc]
