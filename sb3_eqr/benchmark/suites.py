@@ -10,6 +10,7 @@ import yaml
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
+from sb3_eqr.common.arguments import number
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.zoo.checks import nearest
@@ -81,6 +82,15 @@ def check_mapping(where: str, value: Any) -> dict[str, Any]:
     return value
 
 
+def check_scores(where: str, scores: Any) -> None:
+    """
+    :raises ValueError: for anything but two finite numbers, the second above the first: what becomes 0 and what becomes 1
+    """
+    is_pair = isinstance(scores, (list, tuple)) and len(scores) == 2
+    if not (is_pair and all(map(number().holds, scores)) and scores[0] < scores[1]):
+        raise ValueError(f"{where}: expected the scores that become 0 and 1, the second above the first, found {scores!r}")
+
+
 def human_scores(games: list[str]) -> dict[str, Any]:
     """
     :return: the normalisation of Atari 100K: random play 0, a human tester 1
@@ -132,6 +142,8 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     )
     if missing := [game for game in games if game not in normalisation["scores"]]:
         raise ValueError(f"{where}: normalisation: expected two scores for every game, found none for {', '.join(missing)}")
+    for game in games:
+        check_scores(f"{where}: normalisation: {game}", normalisation["scores"][game])
     return Suite(
         name,
         games,

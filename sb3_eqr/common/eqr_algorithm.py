@@ -152,6 +152,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         """
         check_arguments(locals(), ALGORITHM)
         check_arguments(policy_kwargs or {}, POLICY)
+        validation.check_device(device)
         policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
         set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]
@@ -278,7 +279,9 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been set since
-        return super()._setup_learn(*args, **kwargs)
+        result = super()._setup_learn(*args, **kwargs)
+        validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)
+        return result
 
     def _on_step(self) -> None:
         """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""

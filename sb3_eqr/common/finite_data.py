@@ -1,11 +1,12 @@
 """What environments and users hand in must be finite, or nothing of it is stored, learned or normalised with."""
 
+import warnings
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_eqr.common.validation import check_finite, find_infinite
 
@@ -18,13 +19,24 @@ class FiniteData(OffPolicyAlgorithm):
     refused step leaves the replay buffer and the statistics of VecNormalize as they were.
     """
 
+    trained_normalized = False  # whether the last environment was behind VecNormalize; survives saving
     _statistics: dict[str, Any] | None = None  # of the last step that was accepted
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         result = super()._setup_learn(*args, **kwargs)
+        self._warn_without_normalization()
         check_finite("observation", self._last_obs, self.num_timesteps)
         self._statistics = statistics_of(self._vec_normalize_env)
         return result
+
+    def _warn_without_normalization(self) -> None:
+        """Once trained behind VecNormalize, an agent that sees raw observations acts at random."""
+        if self.trained_normalized and self._vec_normalize_env is None:
+            warnings.warn(
+                "This agent was trained behind VecNormalize, and its environment is not: it sees other numbers than it knows. "
+                "Pass VecNormalize.load(path, venv) as env, with the statistics that were saved beside the model."
+            )
+        self.trained_normalized = self._vec_normalize_env is not None
 
     def _store_transition(
         self,
@@ -40,7 +52,7 @@ class FiniteData(OffPolicyAlgorithm):
         try:
             check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
             check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
-            for info in infos:
+            for info in [*infos, *original_infos(normalize)]:
                 check_finite("terminal observation", info.get("terminal_observation", 0), step)
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         except ValueError:
@@ -64,6 +76,15 @@ class FiniteData(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_statistics"]
+
+
+def original_infos(normalize: VecNormalize | None) -> list[dict[str, Any]]:
+    """
+    What the environments said before VecNormalize has clipped their terminal observations, which it does in place. SB3's
+    DummyVecEnv hands out copies; of other processes nothing is left, and what is clipped is finite.
+    """
+    innermost = None if normalize is None else normalize.unwrapped
+    return innermost.buf_infos if isinstance(innermost, DummyVecEnv) else []
 
 
 def statistics_of(normalize: VecNormalize | None) -> dict[str, Any] | None:

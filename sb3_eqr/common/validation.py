@@ -1,18 +1,21 @@
 """Checks, as pure functions: each raises with what was expected, what was found and what to do, or does nothing."""
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from functools import wraps
 from typing import Any, ParamSpec
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.arguments import check, integer, number
 
 P = ParamSpec("P")
+LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_number(name: str, value: Any, low: float, high: float = np.inf, whole: bool = False) -> None:
@@ -38,12 +41,25 @@ def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, s
 
 
 def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | None:
-    """The first NaN or infinity of an array, or with its key of a dictionary of arrays; ``None`` if there is none."""
+    """
+    The first NaN or infinity of an array, or with its key of a dictionary of arrays; ``None`` if there is none. Numbers that
+    float32, in which they are stored, does not hold count as infinite.
+    """
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         array = np.asarray(array)
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            return f"{array[~np.isfinite(array)].flat[0]}{f' of {key!r}' if key else ''}"
+        if np.issubdtype(array.dtype, np.floating) and not (is_held := np.abs(array) <= LARGEST).all():
+            return f"{array[~is_held].flat[0]}{f' of {key!r}' if key else ''}"
     return None
+
+
+def check_transition(action_space: spaces.Space, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray) -> None:
+    """Refuse a transition with an action that there is not, or with a number that is not finite."""
+    for what, values in (("obs", obs), ("next_obs", next_obs), ("reward", reward)):
+        if (found := find_infinite(values)) is not None:
+            raise ValueError(f"{what} must be finite, got {found}. Nothing was stored.")
+    actions, n_actions = np.asarray(action), int(getattr(action_space, "n", 0))
+    if n_actions and not ((actions >= 0) & (actions < n_actions)).all():  # NaN is neither
+        raise ValueError(f"action must be integers in [0, {n_actions - 1}], got {actions.tolist()}. Nothing was stored.")
 
 
 def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewhere: type) -> None:
@@ -93,6 +109,16 @@ def check_action_space(action_space: spaces.Space) -> None:
             f"The algorithm only supports actions that count from 0, but {action_space} was provided. "
             "Wrap the environment with gymnasium.wrappers.TransformAction."
         )
+
+
+def check_device(device: Any) -> None:
+    """Refuse what is no device of PyTorch; warn of a GPU that is not there, in whose place SB3 takes the CPU."""
+    try:
+        wanted = th.device("cpu" if device == "auto" else device)
+    except (RuntimeError, TypeError):
+        raise ValueError(f"device must be 'auto' or a device of PyTorch such as 'cpu' or 'cuda:0', got {device!r}.") from None
+    if wanted.type == "cuda" and not th.cuda.is_available():
+        warnings.warn(f"device: PyTorch finds no GPU, {device} was asked for. The CPU is used.")
 
 
 def check_policy(owner: str, policy: Any, aliases: dict[str, type], observation_space: spaces.Space) -> None:
@@ -151,6 +177,20 @@ def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, init
         raise ValueError(
             f"resets: initial_gamma: expected it and gamma below 1, since 1 - γ is annealed by a factor, found "
             f"{initial_gamma} and {gamma}. Pass initial_gamma=None for a constant γ."
+        )
+
+
+def warn_of_idle_training(last_step: int, learning_starts: int, n_updates: int, buffer: Any) -> None:
+    """Warn of a call of ``learn`` that makes no update, and of a trained agent without its replay buffer."""
+    if learning_starts >= last_step > 0:
+        warnings.warn(
+            f"learning_starts={learning_starts} is not below the last step, {last_step}: no update will be made. "
+            "Pass a smaller learning_starts, or learn for more steps."
+        )
+    if n_updates > 0 and buffer is not None and buffer.size() == 0:
+        warnings.warn(
+            f"The replay buffer is empty, but this agent has made {n_updates} updates: it learns from new transitions alone. "
+            "To continue a run, call load_replay_buffer with the file that was saved beside the model, or resume."
         )
 
 

@@ -104,15 +104,11 @@ def test_a_frame_stack_that_is_not_one(make):
 def test_bad_values_from_the_environment(make, where, what, value, normalize):
     env = make_vec_env(lambda: PoisonEnv(where, value, at=60))
     model = make(VecNormalize(env) if normalize else env)
-    if (where, value, normalize) == ("terminal", np.inf, True):
-        model.learn(100)  # VecNormalize clips it before anyone can see it: what is stored is finite
-        assert th.isfinite(model.replay_buffer.sample(500).rollout_observations).all()
-        return
     with pytest.raises(ValueError, match=f"step 60: expected finite .*{what}s? from the environment, found (nan|-?inf)"):
         model.learn(100)
     assert model.replay_buffer.size() == 59 and model._n_updates > 0
     if normalize:
-        return  # its own running statistics are spoilt by now
+        return  # a resumed VecNormalize has a test of its own
     model.learn(5, reset_num_timesteps=False)  # resets the environment: no transition spans the gap
     assert model.replay_buffer.timeouts[58].all() or model.replay_buffer.dones[58].all()
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
@@ -336,6 +332,43 @@ def test_a_support_that_holds_the_returns_is_not_warned_of():
     kwargs = {"learning_starts": 100, "seed": 0}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(90)
+        EqRRainbow("MlpPolicy", "CartPole-v1", **kwargs, policy_kwargs={"v_min": 0, "v_max": 100}).learn(110)
         scaled = VecNormalize(make_vec_env(lambda: gym.make("CartPole-v1"), 2), norm_reward=True)
         EqRRainbow("MlpPolicy", scaled, **kwargs).learn(200)
+
+
+def test_what_a_buffer_is_given_directly(make):
+    buffer = make(ChainEnv()).replay_buffer
+    obs, one, zero = np.zeros((1, *buffer.obs_shape)), np.ones(1), np.zeros(1)
+    for action in (buffer.action_space.n, -1, np.nan):
+        with pytest.raises(ValueError, match=rf"action must be integers in \[0, {buffer.action_space.n - 1}\], got"):
+            buffer.add(obs, obs, np.array([action]), one, zero, [{}])
+    with pytest.raises(ValueError, match="reward must be finite, got inf"):
+        buffer.add(obs, obs, zero, one * np.inf, zero, [{}])
+    with pytest.raises(ValueError, match=r"next_obs must be finite, got 1e\+39"):  # float32 does not hold it
+        buffer.add(obs, obs + 1e39, zero, one, zero, [{}])
+    assert buffer.size() == 0
+
+
+def test_a_call_of_learn_without_updates_warns(make):
+    with pytest.warns(UserWarning, match=r"learning_starts=50 is not below the last step, 50: no update"):
+        make(ChainEnv(), learning_starts=50).learn(50)
+
+
+def test_an_agent_without_what_it_was_trained_with_warns(make, tmp_path):
+    model = make(VecNormalize(make_vec_env(ChainEnv)))
+    model.learn(60)
+    model.save(tmp_path / "model")
+    bare = type(model).load(tmp_path / "model", make_vec_env(ChainEnv))
+    with pytest.warns(UserWarning) as caught:
+        bare.learn(5)
+    said = " ".join(str(warning.message) for warning in caught)
+    assert "trained behind VecNormalize" in said and "The replay buffer is empty, but this agent has made" in said
+
+
+def test_devices(make):
+    with pytest.raises(ValueError, match=r"device must be 'auto' or a device of PyTorch such as .*, got 'nodevice'"):
+        make(ChainEnv(), device="nodevice")
+    if not th.cuda.is_available():
+        with pytest.warns(UserWarning, match="finds no GPU, cuda:0 was asked for"):
+            make(ChainEnv(), device="cuda:0")

@@ -13,6 +13,7 @@ from sb3_eqr.common.arguments import BUFFER, check_arguments
 from sb3_eqr.common.replay.frame_store import FrameStore
 from sb3_eqr.common.replay.sum_tree import SumTree
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
+from sb3_eqr.common.validation import check_transition
 
 try:
     import psutil
@@ -145,7 +146,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param reward: r_{t+1}
         :param done: whether the episode ended, by a terminal state or a time-out
         :param infos: one dict per environment; ``TimeLimit.truncated`` marks a time-out
+        :raises ValueError: for an action out of range, and for a number that is not finite; nothing is stored then
         """
+        check_transition(self.action_space, obs, next_obs, action, reward)
         follows = np.ones(self.n_envs, dtype=bool)
         for key, store in self._stores.items():
             now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
