@@ -5,6 +5,7 @@ import pathlib
 import shlex
 import sys
 
+import torch as th
 from rich.console import Console
 
 from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of, write_plan
@@ -66,6 +67,10 @@ def check_resources(args: argparse.Namespace) -> str:
     if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
         found = f"{args.cpus_per_run} and {args.gpus_per_run}"
         raise ValueError(f"--cpus-per-run, --gpus-per-run: expected > 0 and >= 0, found {found}")
+    if args.checkpoint_every < 0:
+        raise ValueError(f"--checkpoint-every: expected seconds >= 0, found {args.checkpoint_every}")
+    if args.address is None and args.gpus_per_run > th.cuda.device_count():  # Ray would say so, once it is started
+        raise ValueError(f"--gpus-per-run: expected at most {th.cuda.device_count()} GPUs, found {args.gpus_per_run:g}")
     device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
     if args.address is None:  # else the machines of the cluster count
         check_machine(device, False, "")

@@ -165,7 +165,10 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     if file is not None:
         if not file.is_file():
             raise ValueError(f"--suite-file: there is no file {file}")
-        own = yaml.safe_load(file.read_text(encoding="utf-8"))
+        try:
+            own = yaml.safe_load(file.read_text(encoding="utf-8"))
+        except yaml.YAMLError as error:
+            raise ValueError(f"{file} is no YAML: {error}") from error
         if not isinstance(own, dict):
             raise ValueError(f"{file}: expected suites by name, found {type(own).__name__}. See docs/benchmark.md.")
         entries |= {key: (file, entry) for key, entry in own.items()}

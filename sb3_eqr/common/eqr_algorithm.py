@@ -228,6 +228,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)
+        if getattr(self, "observation_space", None) is None:
+            raise ValueError("env must be an environment or the name of a registered one, got None.")
         name = type(self).__name__
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
@@ -249,7 +251,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        with validation.environment_errors(0):
+            wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         validation.check_action_space(wrapped.action_space)
         return wrapped
 

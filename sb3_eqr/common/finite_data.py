@@ -8,7 +8,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_eqr.common.validation import check_finite, find_infinite
+from sb3_eqr.common.validation import check_finite, environment_errors, find_infinite
 
 STATISTICS = ("obs_rms", "ret_rms")  # of VecNormalize
 
@@ -23,11 +23,17 @@ class FiniteData(OffPolicyAlgorithm):
     _statistics: dict[str, Any] | None = None  # of the last step that was accepted
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        result = super()._setup_learn(*args, **kwargs)
+        with environment_errors(self.num_timesteps):
+            result = super()._setup_learn(*args, **kwargs)
         self._warn_without_normalization()
         check_finite("observation", self._last_obs, self.num_timesteps)
         self._statistics = statistics_of(self._vec_normalize_env)
         return result
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
+        """As SB3's; an environment that breaks its interface is named."""
+        with environment_errors(self.num_timesteps):
+            return super().collect_rollouts(*args, **kwargs)
 
     def _warn_without_normalization(self) -> None:
         """Once trained behind VecNormalize, an agent that sees raw observations acts at random."""

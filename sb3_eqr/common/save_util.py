@@ -78,8 +78,16 @@ def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
     return found
 
 
+def refuse_folder(path: Any) -> None:
+    """Raise ValueError if a file is wanted and a folder is given."""
+    if isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).is_dir():
+        if not any(pathlib.Path(f"{path}.{suffix}").is_file() for suffix in ("zip", "pkl")):
+            raise ValueError(f"{path} must be a file, got a folder. A folder of checkpoints is for resume.")
+
+
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
-    """A model's file by its path, whose ending may be left out."""
+    """A model's file by its path, whose ending may be left out; raises ValueError for a folder."""
+    refuse_folder(path)
     return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
 
 
@@ -227,6 +235,7 @@ class SafeFiles(OffPolicyAlgorithm):
 
     def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:
         before = self.replay_buffer
+        refuse_folder(path)
         file = open_path(path, "r", verbose=self.verbose, suffix="pkl")
         try:
             is_ours = zipfile.is_zipfile(file)

@@ -1,8 +1,11 @@
 """Checks, as pure functions: each raises with what was expected, what was found and what to do, or does nothing."""
 
 import inspect
+import pathlib
+import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
 from typing import Any, ParamSpec
@@ -28,6 +31,30 @@ def check_number(name: str, value: Any, low: float, high: float = np.inf, whole:
     :raises ValueError: if it is no finite number in that range
     """
     check(name, value, integer(low, high) if whole else number(low, high))
+
+
+# The code that takes what an environment returns.
+CONSUMERS = ("stable_baselines3/common/vec_env/", "stable_baselines3/common/monitor", "/gymnasium/")
+
+
+@contextmanager
+def environment_errors(step: int) -> Iterator[None]:
+    """
+    An environment that breaks the interface of gymnasium makes errors in the code that takes what it returns. They get its
+    name; errors of the environment's own code stay as they are.
+
+    :raises ValueError: in place of such an error
+    """
+    try:
+        yield
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
+        innermost = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename).as_posix()
+        if not any(name in innermost for name in CONSUMERS):
+            raise
+        raise ValueError(
+            f"step {step}: the environment must follow the interface of gymnasium, got {type(error).__name__}: {error}. "
+            "stable_baselines3.common.env_checker.check_env(env) says where it does not."
+        ) from error
 
 
 def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:

@@ -140,6 +140,17 @@ def prepare_resuming(args: argparse.Namespace) -> None:
     resuming.install(args.checkpoint_every, args.resume, args.trust)
 
 
+def check_runs(arguments: list[str]) -> None:
+    """Leave with a message if ``all_plots`` would draw nothing."""
+    parser = argparse.ArgumentParser(add_help=False)
+    for flags in (("-a", "--algos"), ("-e", "--env"), ("-f", "--exp-folders")):
+        parser.add_argument(*flags, nargs="+", default=[])
+    args = parser.parse_known_args(arguments)[0]
+    places = [pathlib.Path(folder) / algo for folder in args.exp_folders for algo in args.algos]
+    if args.env and places and not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
+        fail(f"all_plots: expected runs on {', '.join(args.env)} in {', '.join(map(str, places))}, found none.")
+
+
 def check_trained(args: argparse.Namespace) -> None:
     """Leave with a message if the trained agent is not where it is looked for."""
     try:
@@ -218,6 +229,8 @@ def main() -> None:
 
         hub.prepare("--dry-run" in arguments)
         arguments = [argument for argument in arguments if argument != "--dry-run"]
+    if command == "all_plots":
+        check_runs(arguments)
     if command not in PLOTS and not {"-h", "--help"} & set(arguments):
         args = parse(arguments)
         if args.algo is not None:

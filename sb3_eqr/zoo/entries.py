@@ -10,6 +10,7 @@ import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS
 
+from sb3_eqr.common.arguments import DICTIONARY, FLAG, NONE, TEXT, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
@@ -25,6 +26,13 @@ FLAGS = {
     "verbose": "--verbose",
     "tensorboard_log": "--tensorboard-log",
     "_init_setup_model": "nothing",
+}
+# What it reads itself.
+RULES = {
+    "n_timesteps": number(0, above=True),
+    "n_envs": integer(1),
+    "frame_stack": integer(1) | NONE,
+    "normalize": FLAG | TEXT | DICTIONARY,
 }
 
 
@@ -45,9 +53,12 @@ def read_file(path: str) -> dict[str, Any]:
         exec(file.read_text(encoding="utf-8"), found)
         return found["hyperparams"]
     try:
-        return yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
     except yaml.YAMLError as error:
         fail(f"{path} is no YAML: {error}")
+    if not isinstance(entries, dict):
+        fail(f"{path}: expected entries by the names of environments, found {entries!r:.60}.")
+    return entries
 
 
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
@@ -62,6 +73,8 @@ def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
     name = env_id if env_id in entries else "atari" if is_atari else "default"
     if name not in entries:
         fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries)}. Add one, or use another file.")
+    if not isinstance(entries[name] or {}, dict):
+        fail(f"{path}: {name}: expected hyperparameters by name, found {entries[name]!r:.60}.")
     entry = {**(entries[name] or {}), **changes}
     for key in ("policy", "n_timesteps"):
         if key not in entry:
@@ -95,6 +108,9 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
             fail(f"{source}: {key!r} cannot stand there: RL Zoo sets it by {FLAGS[key]}.")
         if key not in legal:
             fail(f"{source}: {key!r} is no argument of {algorithm.__name__}.{nearest(key, legal)}")
+    for key, rule in RULES.items():
+        if key in entry and not rule.holds(entry[key]):
+            fail(f"{source}: {key} must be {rule.says}, got {entry[key]!r}.")
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))
     policy_kwargs = entry.get("policy_kwargs")
     if policy is not None and isinstance(policy_kwargs, dict):

@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.checkpoints import ExactCheckpointCallback
+from sb3_eqr.zoo.checks import fail
 
 FOLDER = "checkpoints"  # in the folder of a run
 
@@ -26,6 +27,13 @@ class ResumableExperiment(ExperimentManager):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.continue_training = self.continue_training or self.resume is not None
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """RL Zoo's; what cannot be built is told without a traceback."""
+        try:
+            return super().setup_experiment()
+        except (ValueError, TypeError, IndexError, ImportError) as error:
+            fail(f"{self.algo} on {self.env_name.gym_id}, by {self.config}: {error}")
 
     def create_callbacks(self) -> None:
         """RL Zoo's, and one for the checkpoints."""

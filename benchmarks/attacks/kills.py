@@ -1,0 +1,108 @@
+"""SIGKILL at random moments of runs that write checkpoints: nothing may be lost, and no number may change."""
+
+import json
+import multiprocessing
+import os
+import pathlib
+import random
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.attacks import Finding
+from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
+from sb3_eqr.benchmark.plan import plan_runs
+from sb3_eqr.benchmark.run import RESULT, Settings
+from sb3_eqr.benchmark.suites import load_suite
+from sb3_eqr.benchmark.training import execute
+from sb3_eqr.common.checkpoints import find_checkpoints
+
+STEPS, SAVE_FREQ = 3_000, 60  # several checkpoints a second
+LONGEST = 1.5  # seconds that a run lives before it is killed
+FORK = multiprocessing.get_context("fork")  # nothing has to be imported again
+
+
+def train(folder: pathlib.Path) -> None:
+    """A run, from its beginning or from its last checkpoint, to its end."""
+    th.set_num_threads(1)
+    if find_checkpoints(folder):
+        model = EqRQRDQN.resume(folder, make_vec_env("CartPole-v1"))
+    else:
+        small: dict[str, Any] = {"n_blocks": 2, "net_arch": [16], "latent_hidden_dim": 16}
+        options: dict[str, Any] = {"train_freq": 8, "gradient_steps": 1, "learning_starts": 100, "buffer_size": 2_000}
+        model = EqRQRDQN("MlpPolicy", "CartPole-v1", **options, policy_kwargs=small, seed=0)
+    left = STEPS - model.num_timesteps
+    if left > 0:
+        model.learn(left, ExactCheckpointCallback(SAVE_FREQ, folder), reset_num_timesteps=False)
+    model.save(folder / "final.zip")
+
+
+def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> list[int]:
+    """
+    Start a run as often as it takes: the first ones are killed, the others may end.
+
+    :return: exit codes that are neither 0 nor that of the kill
+    """
+    strange = []
+    for count in range(0, kills + 1, at_once):
+        processes = [FORK.Process(target=start) for _ in range(at_once)]
+        for process in processes:
+            process.start()
+        for process in processes:
+            if count < kills:
+                process.join(rng.uniform(0, LONGEST / at_once))
+                if process.pid is not None and process.is_alive():
+                    os.kill(process.pid, signal.SIGKILL)
+            process.join()
+            strange += [process.exitcode] if process.exitcode not in (0, -signal.SIGKILL) else []
+    return strange
+
+
+def left_over(folder: pathlib.Path) -> list[str]:
+    """Partial files: they begin with a dot."""
+    return [str(path) for path in folder.rglob(".*")]
+
+
+def same_parameters(first: pathlib.Path, second: pathlib.Path) -> bool:
+    """Whether two runs ended with the same bits."""
+    one, other = (EqRQRDQN.load(folder / "final.zip").policy.state_dict() for folder in (first, second))
+    return all(th.equal(one[name], other[name]) for name in one)
+
+
+def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: int) -> Finding:
+    """One run, or several at once on one folder, killed again and again, beside an undisturbed one."""
+    undisturbed, killed = folder / "undisturbed", folder / f"killed_{at_once}"
+    if not (undisturbed / "final.zip").is_file():
+        kill_until_done(lambda: train(undisturbed), 0, rng)
+    killed.mkdir(parents=True)
+    strange = kill_until_done(lambda: train(killed), kills, rng, at_once)
+    is_there = (killed / "final.zip").is_file()
+    is_same, partial = is_there and same_parameters(undisturbed, killed), left_over(killed)
+    name = f"{kills} SIGKILLs of a run" if at_once == 1 else f"{kills} SIGKILLs of {at_once} runs on one folder"
+    found = f"{'equal bits' if is_same else 'other bits' if is_there else 'lost'}, {len(partial)} partial, {len(strange)} errors"
+    holds = is_same and not partial and not strange
+    return Finding(name, "equal bits, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
+
+
+def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Finding:
+    """The runs of the suite smoke as Ray's workers do them, killed, beside undisturbed ones."""
+    suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
+    agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
+    scores: dict[str, list[Any]] = {}
+    strange, partial = [], []
+    for name, count in (("undisturbed", 0), ("killed", kills // len(agents) + 1)):
+        for run in plan_runs(folder / name, suite, agents, 1):
+            strange += kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
+            result = json.loads((run.folder / RESULT).read_text()) if (run.folder / RESULT).is_file() else {}
+            scores.setdefault(name, []).append((result.get("evaluations"), result.get("training")))
+        partial += left_over(folder / name)
+    is_same = scores["undisturbed"] == scores["killed"] and None not in scores["killed"][0]
+    found = f"{'equal' if is_same else 'other'} scores, {len(partial)} partial, {len(strange)} errors"
+    holds = is_same and not partial and not strange
+    name = f"{kills} SIGKILLs of the benchmark (smoke)"
+    return Finding(name, "equal scores, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
+
+
