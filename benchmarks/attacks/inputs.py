@@ -4,7 +4,8 @@ import contextlib
 import io
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ import numpy as np
 
 from benchmarks.attacks import Finding
 from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
-from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS
+from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, Rule
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import load_configuration
 
@@ -29,29 +30,27 @@ def make(agent: type = EqRQRDQN, env: Any = "CartPole-v1", policy: str = "MlpPol
     return agent(policy, env, **{"buffer_size": 500, "learning_starts": 20, **kwargs}, policy_kwargs=policy_kwargs)
 
 
+def refused(table: dict[str, Rule], names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """The names of a table, or some of them, with each value of the pool that their rules refuse."""
+    for name in names or table:
+        yield from ((name, value) for value in POOL if not table[name].holds(value))
+
+
 def from_the_tables() -> Iterator[Case]:
-    """Each argument with each value of the pool that its rule refuses; those of the algorithm once more, set later."""
+    """Each argument with each value that its rule refuses; those of the algorithm once more, set later."""
     model = make()
-    for name, rule in ALGORITHM.items():
-        for value in POOL:
-            if not rule.holds(value):
-                yield f"{name}={value!r}", name, lambda n=name, v=value: EqRQRDQN("MlpPolicy", "CartPole-v1", **{n: v})
-                if not isinstance(value, (dict, list)) and hasattr(model, name):
-                    yield f"model.{name}={value!r}", name, lambda n=name, v=value: set_and_learn(model, n, v)
-    for name, rule in POLICY.items():
-        agent = EqRQRDQN if name == "n_quantiles" else EqRRainbow
-        for value in POOL:
-            if not rule.holds(value):
-                call = lambda n=name, v=value, a=agent: a("MlpPolicy", "CartPole-v1", policy_kwargs={n: v})  # noqa: E731
-                yield f"policy_kwargs: {name}={value!r}", name, call
-    for name, rule in BUFFER.items():
-        for value in POOL:
-            if not rule.holds(value) and name in ("alpha", "beta", "final_beta", "frame_stack"):
-                yield f"buffer: {name}={value!r}", name, lambda n=name, v=value: make(replay_buffer_kwargs={n: v})
-    for name, rule in RESETS.items():
-        for value in POOL:
-            if not rule.holds(value):
-                yield f"resets: {name}={value!r}", name, lambda n=name, v=value: make(resets={n: v})
+    for name, value in refused(ALGORITHM):
+        yield f"{name}={value!r}", name, partial(EqRQRDQN, "MlpPolicy", "CartPole-v1", **{name: value})
+        if hasattr(model, name) and not isinstance(value, (dict, list)):
+            yield f"model.{name}={value!r}", name, partial(set_and_learn, model, name, value)
+    for name, value in refused(POLICY):
+        kind = EqRQRDQN if name == "n_quantiles" else EqRRainbow
+        call = partial(kind, "MlpPolicy", "CartPole-v1", policy_kwargs={name: value})
+        yield f"policy_kwargs: {name}={value!r}", name, call
+    for name, value in refused(BUFFER, ("alpha", "beta", "final_beta", "frame_stack")):
+        yield f"buffer: {name}={value!r}", name, partial(make, replay_buffer_kwargs={name: value})
+    for name, value in refused(RESETS):
+        yield f"resets: {name}={value!r}", name, partial(make, resets={name: value})
 
 
 def set_and_learn(model: Any, name: str, value: Any) -> None:
@@ -89,54 +88,50 @@ class Broken(gym.Env):
         return obs, reward, False, False, None if self.how == "no info" else {}
 
 
-BREAKS = ("continuous actions", "no observation space", "another shape at reset", "reset without info", "another shape")
+BREAKS: tuple[str, ...] = ("continuous actions", "no observation space", "another shape at reset", "reset without info")
+BREAKS += ("another shape",)
 BREAKS += ("text as reward", "no reward", "an array as reward", "four results", "no info")
 
 
 def by_hand() -> Iterator[Case]:
     """What no table says."""
-    model, names = make(), lambda *words: " ".join(words)
+    model = make()
+    observations = (np.full(4, NAN), np.full(4, INF), np.zeros(3), np.zeros((2, 2, 2)), "x", None)
+    groups = ("SU(2)", "SO(1)", "GL(0)", "SE(2)^0", 2, "", "so(2)", "SO(2)^")
+    frequencies, paths = (0, -1, 2.5, True, "x", None), ("nowhere", "nowhere.zip", "/")
+    many: list[tuple[str, str, Iterable[Any], Callable[[Any], Any]]] = [
+        ("learn({!r})", "total_timesteps", (-5, NAN, "many", None), model.learn),
+        ("predict({!r})", "observation", observations, model.predict),
+        ("device={!r}", "device", ("nodevice", 3.5, "cuda:x"), lambda value: make(device=value)),
+        ("group={!r}", "", groups, lambda value: make(policy_kwargs={"group": value, "n_blocks": None})),
+        ("policy={!r}", "", ("LstmPolicy", "CnnPolicy", "MultiInputPolicy", 3, None), lambda value: make(policy=value)),
+        ("env={!r}", "", ("NoSuch-v0", 3, None, "Pendulum-v1"), lambda value: make(env=value).learn(5)),
+        ("an environment with {}", "", BREAKS, lambda value: make(env=Broken(value)).learn(30)),
+        ("save_freq={!r}", "save_freq", frequencies, lambda value: ExactCheckpointCallback(value, "x")),
+        ("keep={!r}", "keep", frequencies, lambda value: ExactCheckpointCallback(1, "x", keep=value)),
+        ("buffer.add of action {}", "action", (2, -1, NAN), lambda value: add(model, value, 0.0)),
+        ("buffer.add of reward {}", "reward", (NAN, INF), lambda value: add(model, 0, value)),
+        ("load({!r})", "", paths, EqRQRDQN.load),
+        ("resume({!r})", "", paths, lambda value: EqRQRDQN.resume(value, model.get_env())),
+        ("load_replay_buffer({!r})", "", paths, model.load_replay_buffer),
+        ("load_representation({!r})", "", paths, model.load_representation),
+        ("resets={!r}", "resets", (3, {"intervall": 1}), lambda value: make(resets=value)),
+    ]
+    for what, word, values, call in many:
+        yield from ((what.format(value), word, partial(call, value)) for value in values)
     yield "max_grad_norm=-1", "max_grad_norm", lambda: make(max_grad_norm=-1)
     yield "an argument that there is not", "aet_coeff", lambda: make(aet_coeff=1.0)
     yield "a policy argument that there is not", "n_block", lambda: make(policy_kwargs={"n_block": 1})
     yield "a keyword of load", "gama", lambda: EqRQRDQN.load("nowhere", gama=1)
-    for value in (-5, NAN, "many", None):
-        yield f"learn({value!r})", "total_timesteps", lambda v=value: model.learn(v)
-    for obs in (np.full(4, NAN), np.full(4, INF), np.zeros(3), np.zeros((2, 2, 2)), "x", None):
-        yield f"predict({obs!r})", "observation", lambda o=obs: model.predict(o)
-    for device in ("nodevice", 3.5, "cuda:x"):
-        yield f"device={device!r}", "device", lambda d=device: make(device=d)
-    for group in ("SU(2)", "SO(1)", "GL(0)", "SE(2)^0", 2, "", "so(2)", "SO(2)^"):
-        yield f"group={group!r}", "", lambda g=group: make(policy_kwargs={"group": g, "n_blocks": None})
-    for low, high in ((1, 1), (2, -2)):
-        yield f"v_min={low}, v_max={high}", "v_min", lambda a=low, b=high: make(EqRRainbow, policy_kwargs={"v_min": a, "v_max": b})
-    for policy in ("LstmPolicy", "CnnPolicy", "MultiInputPolicy", 3, None):
-        yield f"policy={policy!r}", "", lambda p=policy: make(policy=p)
-    for env in ("NoSuch-v0", 3, None, "Pendulum-v1"):
-        yield f"env={env!r}", "", lambda e=env: make(env=e).learn(5)
-    for how in BREAKS:
-        yield f"an environment with {names(how)}", "", lambda h=how: make(env=Broken(h)).learn(30)
+    yield "v_min above v_max", "v_min", lambda: make(EqRRainbow, policy_kwargs={"v_min": 2, "v_max": -2})
+    yield "v_min equal to v_max", "v_min", lambda: make(EqRRainbow, policy_kwargs={"v_min": 1, "v_max": 1})
     yield "a buffer that is too small", "buffer_size", lambda: make(buffer_size=3)
     yield "a batch of one", "batch_size", lambda: make(batch_size=1)
     yield "no loss at all", "td_coef", lambda: make(td_coef=0, prediction_depth=0)
     yield "whiten without a group", "whiten", lambda: make(policy_kwargs={"whiten": True, "group": None})
     yield "GET without inverses", "symmetry_coef", lambda: make(policy_kwargs={"group": "none"})
     yield "a configuration that there is not", "rainbo", lambda: load_configuration("rainbo")
-    for value in (0, -1, 2.5, True, "x", None):
-        yield f"save_freq={value!r}", "save_freq", lambda v=value: ExactCheckpointCallback(v, "x")
-        yield f"keep={value!r}", "keep", lambda v=value: ExactCheckpointCallback(1, "x", keep=v)
-    yield "resets with an unknown key", "intervall", lambda: make(resets={"intervall": 1})
-    yield "resets as a number", "resets", lambda: make(resets=3)
     yield "a schedule's arguments", "interval", lambda: ResetSchedule(interval=0)
-    for action in (2, -1, NAN):
-        yield f"buffer.add of action {action}", "action", lambda a=action: add(model, a, 0.0)
-    for reward in (NAN, INF):
-        yield f"buffer.add of reward {reward}", "reward", lambda r=reward: add(model, 0, r)
-    for path in ("nowhere", "nowhere.zip", "/"):
-        yield f"load({path!r})", "", lambda p=path: EqRQRDQN.load(p)
-        yield f"resume({path!r})", "", lambda p=path: EqRQRDQN.resume(p, model.get_env())
-        yield f"load_replay_buffer({path!r})", "", lambda p=path: model.load_replay_buffer(p)
-        yield f"load_representation({path!r})", "", lambda p=path: model.load_representation(p)
 
 
 def add(model: Any, action: float, reward: float) -> None:
@@ -159,7 +154,19 @@ def ask(case: Case) -> str | None:
             return f"{what}: {seconds:.1f} s"
         if word not in text or not text:
             return f"{what}: {type(error).__name__} does not say {word!r}: {text[:100]}"
-        is_explained = any(part in text for part in ("must", "expected", "needs", "Did you mean", "No such file", "doesn't exist", "only supports", "unknown"))
+        is_explained = any(
+            part in text
+            for part in (
+                "must",
+                "expected",
+                "needs",
+                "Did you mean",
+                "No such file",
+                "doesn't exist",
+                "only supports",
+                "unknown",
+            )
+        )
         return None if is_explained else f"{what}: {type(error).__name__} does not say what was expected: {text[:100]}"
     except Exception as error:
         return f"{what}: {type(error).__name__}: {str(error)[:100]}"

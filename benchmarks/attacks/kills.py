@@ -40,7 +40,7 @@ def train(folder: pathlib.Path) -> None:
     model.save(folder / "final.zip")
 
 
-def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> list[int]:
+def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> list[Any]:
     """
     Start a run as often as it takes: the first ones are killed, the others may end.
 
@@ -82,7 +82,9 @@ def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: i
     is_there = (killed / "final.zip").is_file()
     is_same, partial = is_there and same_parameters(undisturbed, killed), left_over(killed)
     name = f"{kills} SIGKILLs of a run" if at_once == 1 else f"{kills} SIGKILLs of {at_once} runs on one folder"
-    found = f"{'equal bits' if is_same else 'other bits' if is_there else 'lost'}, {len(partial)} partial, {len(strange)} errors"
+    found = (
+        f"{'equal bits' if is_same else 'other bits' if is_there else 'lost'}, {len(partial)} partial, {len(strange)} errors"
+    )
     holds = is_same and not partial and not strange
     return Finding(name, "equal bits, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
 
@@ -104,5 +106,3 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
     holds = is_same and not partial and not strange
     name = f"{kills} SIGKILLs of the benchmark (smoke)"
     return Finding(name, "equal scores, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
-
-

@@ -1,10 +1,13 @@
 """Checkpoints: everything that training needs to continue exactly, as one folder that is complete or absent."""
 
+import errno
 import hashlib
 import json
 import pathlib
 import shutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -38,7 +41,7 @@ def write_checkpoint(
     env = model.get_env()
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
-    with atomic_folder(checkpoint) as partial:
+    with _last_named(folder), atomic_folder(checkpoint) as partial:
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
             model.save_replay_buffer(partial / BUFFER)
@@ -56,6 +59,17 @@ def write_checkpoint(
     for old in find_checkpoints(folder)[:-keep]:
         shutil.rmtree(old, ignore_errors=True)
     return checkpoint
+
+
+@contextmanager
+def _last_named(folder: pathlib.Path) -> Iterator[None]:
+    """Where the disk is full, say which checkpoint is left."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.ENOSPC or not (left := find_checkpoints(folder)):
+            raise
+        raise OSError(errno.ENOSPC, f"{error.strerror}. The last checkpoint, {left[-1].name}, is whole") from error
 
 
 def checksum(path: pathlib.Path) -> str:

@@ -1,6 +1,7 @@
 """Files and folders that are complete or absent, whoever else writes there and whenever a process is killed."""
 
 import contextlib
+import errno
 import glob
 import os
 import pathlib
@@ -72,10 +73,26 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
                 os.close(descriptor)
                 descriptor = None
     try:
-        yield partial
+        with _full_disk_named(path):
+            yield partial
     finally:
         _remove(partial)
         os.close(descriptor)  # and the lock with it
+
+
+@contextmanager
+def _full_disk_named(path: pathlib.Path) -> Iterator[None]:
+    """What a full disk makes of a write, PyTorch's errors included, as an OSError that says what is left."""
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and getattr(cause, "errno", None) != errno.ENOSPC:
+            cause = cause.__context__
+        if cause is None:
+            raise
+        state = "is as it was" if path.exists() else "was not written"
+        raise OSError(errno.ENOSPC, f"No space left on the disk of {path.parent}: {path.name} {state}") from error
 
 
 def _remove_leftovers(path: pathlib.Path) -> None:

@@ -38,6 +38,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="auto", help="of PyTorch (default: auto)")
     parser.add_argument("--deterministic", action="store_true", help="let the agent act without noise")
     parser.add_argument("--video", action="store_true", help="also write play.mp4 and play.gif")
+    parser.add_argument("--trust", action="store_true", help="let MODEL, and what RL Zoo wrote beside it, name code that runs")
     parser.add_argument("--out", type=pathlib.Path, metavar="FOLDER", help="(default: MODEL without .zip, and _diagnostics)")
     return parser
 
@@ -49,8 +50,9 @@ def run(args: argparse.Namespace) -> None:
     """
     if args.n_envs < 1:
         raise ValueError(f"--n-envs: expected at least 1, found {args.n_envs}")
-    model = load_model(args.model, args.algo, args.device)
-    env = make_env(model, args.model, args.env, parse_kwargs(args.env_kwargs), args.n_envs, args.seed, args.video)
+    model = load_model(args.model, args.algo, args.device, args.trust)
+    kwargs = parse_kwargs(args.env_kwargs)
+    env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust)
     depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
     try:
         played = play(model, env, args.steps, depth, args.deterministic, args.seed)

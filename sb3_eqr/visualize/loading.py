@@ -18,13 +18,15 @@ from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.save_util import is_whole_model
 from sb3_eqr.visualize.latents import FACTOR_KEYS
+from sb3_eqr.visualize.trust import check_statistics, check_zoo_folder
 
 
-def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto") -> EqRAlgorithm:
+def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqRAlgorithm:
     """
     :param path: of a file that ``save`` wrote
     :param algo: one of ``AGENTS``; found out where not given
     :param device: of PyTorch
+    :param trust: as in ``load``
     :raises ValueError: if there is no such file, or it holds something else
     """
     if not path.is_file():
@@ -32,7 +34,7 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
     if not is_whole_model(path):
         raise ValueError(f"{path}: expected a whole file of an agent's save, found one that is cut off or something else")
     try:
-        return AGENTS[algo or find_algorithm(path)].load(path, device=device)
+        return AGENTS[algo or find_algorithm(path)].load(path, device=device, trust=trust)
     except (TypeError, RuntimeError) as error:
         raise ValueError(f"{path}: expected an agent saved by this version of sb3_eqr and by --algo: {error}") from error
 
@@ -66,6 +68,7 @@ def make_env(
     n_envs: int = 1,
     seed: int = 0,
     render: bool = False,
+    trust: bool = False,
 ) -> VecEnv:
     """
     The environment as in training. What RL Zoo wrote beside the model says it; for another, Atari is preprocessed as by
@@ -78,12 +81,15 @@ def make_env(
     :param n_envs: number of environments
     :param seed: of the first environment
     :param render: whether it is asked to draw itself
-    :raises ValueError: if no environment is known, or it is not the agent's
+    :param trust: whether the files beside the model may name code that runs
+    :raises ValueError: if no environment is known, it is not the agent's, or its files need ``trust``
     :raises ImportError: if RL Zoo or the environment is not installed
     """
     sb3_eqr.envs.register()
     kwargs = dict(env_kwargs or {})
     zoo = find_zoo_folder(path)
+    if zoo is not None and not trust:
+        check_zoo_folder(zoo)
     if zoo is not None and env_id in (None, zoo_arguments(zoo)["env"]):
         env = _zoo_env(zoo, kwargs, n_envs, seed, render)
     elif env_id is None:
@@ -96,6 +102,8 @@ def make_env(
         env = _plain_env(env_id, kwargs, n_envs, seed)
     statistics = path.parent / "vecnormalize.pkl"
     if unwrap_vec_normalize(env) is None and statistics.is_file():
+        if not trust:
+            check_statistics(statistics)
         env = VecNormalize.load(str(statistics), env)
     normalize = unwrap_vec_normalize(env)
     if normalize is not None:
@@ -125,7 +133,7 @@ def zoo_arguments(folder: pathlib.Path) -> dict[str, Any]:
     """
     import yaml
 
-    # RL Zoo writes an OrderedDict and reads it in this way, too; the model beside it is no safer.
+    # As RL Zoo reads it: make_env has looked at it, or it is trusted.
     return yaml.load((folder / "args.yml").read_text(encoding="utf-8"), Loader=yaml.UnsafeLoader)
 
 

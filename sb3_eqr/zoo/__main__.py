@@ -186,6 +186,8 @@ def run(command: str, arguments: list[str]) -> None:
     :param command: one of ``COMMANDS``
     :param arguments: RL Zoo's own, on its command line
     """
+    if command == "all_plots":
+        check_runs(arguments)
     sys.argv = [f"sb3-eqr {command}", *arguments]
     try:
         if command in PLOTS:
@@ -212,6 +214,26 @@ def run(command: str, arguments: list[str]) -> None:
         raise
 
 
+def prepare(command: str, arguments: list[str]) -> list[str]:
+    """Check what a command is asked, before RL Zoo starts; returns what is left for RL Zoo."""
+    if command in PLOTS:
+        return arguments
+    args = parse(arguments)
+    if args.algo is not None:
+        check_algo(args.algo)
+    if command == "train":
+        path = prepare_training(args)
+        prepare_resuming(args)
+        arguments = without_resuming(arguments)
+        return arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
+    if command in LOADING and args.algo is not None:
+        check_machine(args.device, False, "")
+        downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
+        if not downloads:
+            check_trained(args)
+    return arguments
+
+
 def main() -> None:
     """The command line."""
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
@@ -229,23 +251,8 @@ def main() -> None:
 
         hub.prepare("--dry-run" in arguments)
         arguments = [argument for argument in arguments if argument != "--dry-run"]
-    if command == "all_plots":
-        check_runs(arguments)
-    if command not in PLOTS and not {"-h", "--help"} & set(arguments):
-        args = parse(arguments)
-        if args.algo is not None:
-            check_algo(args.algo)
-        if command == "train":
-            path = prepare_training(args)
-            prepare_resuming(args)
-            arguments = without_resuming(arguments)
-            if path != args.conf_file:
-                arguments = [*arguments, "--conf-file", str(path)]  # the last one counts
-        elif command in LOADING and args.algo is not None:
-            check_machine(args.device, False, "")
-            downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
-            if not downloads:
-                check_trained(args)
+    if not {"-h", "--help"} & set(arguments):
+        arguments = prepare(command, arguments)
     run(command, arguments)
 
 

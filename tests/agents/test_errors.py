@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
+from benchmarks.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from tests.models import EITHER, SMALL, loss_terms
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
@@ -372,3 +373,8 @@ def test_devices(make):
     if not th.cuda.is_available():
         with pytest.warns(UserWarning, match="finds no GPU, cuda:0 was asked for"):
             make(ChainEnv(), device="cuda:0")
+
+
+def test_every_wrong_argument_is_answered_by_name():
+    found = wrong_arguments()
+    assert found.holds, found.details

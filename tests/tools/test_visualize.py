@@ -281,6 +281,29 @@ def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
     assert other.num_envs == 2
 
 
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("args.yml", "a: !!python/object/apply:os.getcwd []", "must hold plain values, got: .*Pass|pass --trust"),
+        ("args.yml", "env: Ring-v0\ngym_packages: [antigravity]", "got antigravity"),
+        ("args.yml", "env: antigravity:Ring-v0", "got antigravity:Ring-v0"),
+        ("config.yml", "env_wrapper: [{subprocess.run: {}}]", r"got subprocess\.run"),
+        ("config.yml", "normalize: dict(norm_obs=print())", "got dict"),
+        ("vecnormalize.pkl", pickle.dumps(functools.partial(print)), r"it names functools\.partial"),
+    ],
+)
+def test_files_beside_the_model_are_looked_at_first(tmp_path, name, content, message):
+    folder = tmp_path / "Ring-v0_1" / "Ring-v0"
+    folder.mkdir(parents=True)
+    model = make_model()
+    model.save(folder.parent / "best_model")
+    (folder / "args.yml").write_text("env: Ring-v0")
+    (folder / "config.yml").write_text("policy: MlpPolicy")
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError, match=message):
+        loading.make_env(model, folder.parent / "best_model.zip")
+
+
 def test_the_algorithm_is_in_the_file(tmp_path):
     make_model(EqRRainbow).save(tmp_path / "rainbow")
     assert loading.find_algorithm(tmp_path / "rainbow.zip") == "eqr_rainbow"

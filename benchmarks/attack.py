@@ -1,0 +1,77 @@
+"""
+Attacks on the package: kills, wrong and hostile input, NaN, damaged files, a full disk, threads. Prints a row for each.
+
+    python -m benchmarks.attack                       # all: about a quarter of an hour
+    python -m benchmarks.attack --only inputs files --kills 20
+    python -m benchmarks.attack --out docs/results/attack.md
+"""
+
+import argparse
+import pathlib
+import random
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+
+import torch as th
+
+from benchmarks.attacks import Finding, command_lines, files, inputs, kills, numbers
+
+
+def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Callable[[], Finding]]]:
+    """
+    :param folder: for what they write
+    :param n_kills: of each test that kills
+    :param seed: of moments and places
+    :return: by the name of ``--only``
+    """
+    rng = random.Random(seed)
+    return {
+        "kills": [
+            lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=1),
+            lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=2),
+            lambda: kills.killed_benchmark(folder / "benchmark", n_kills, rng),
+        ],
+        "inputs": [inputs.wrong_arguments, lambda: command_lines.wrong_command_lines(folder / "lines")],
+        "numbers": [lambda: numbers.not_a_number(folder / "numbers")],
+        "files": [
+            lambda: files.strangers_files(folder / "hostile"),
+            lambda: files.damaged_files(folder / "damaged", rng),
+            lambda: files.full_disk(folder / "disk"),
+            lambda: files.shared_path(folder / "shared"),
+        ],
+    }
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--only", nargs="+", choices=list(attacks(pathlib.Path(), 0, 0)), help="some of the parts (default: all)"
+    )
+    parser.add_argument("--kills", type=int, default=100, help="of each test that kills (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of moments and places (default: 0)")
+    parser.add_argument("--out", type=pathlib.Path, help="a Markdown file for the table")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    rows = ["| test | must | found | seconds |", "|---|---|---|---|"]
+    failed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name, tests in attacks(pathlib.Path(folder), args.kills, args.seed).items():
+            for test in tests if args.only is None or name in args.only else []:
+                began = time.monotonic()
+                finding = test()
+                failed += not finding.holds
+                mark = "" if finding.holds else "**falls short:** "
+                rows.append(f"| {finding.test} | {finding.must} | {mark}{finding.found} | {time.monotonic() - began:.0f} |")
+                print(rows[-1], *finding.details, sep="\n  ", flush=True)
+    if args.out is not None:
+        command = f"python -m benchmarks.attack --kills {args.kills} --seed {args.seed}"
+        args.out.write_text("\n".join(["# Attacks", "", f"```sh\n{command}\n```", "", *rows, ""]), encoding="utf-8")
+    raise SystemExit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()
