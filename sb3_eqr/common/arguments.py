@@ -131,7 +131,7 @@ POLICY: dict[str, Rule] = {
     "parameterization": TEXT,
     "whiten": FLAG,
     "layer_norm": FLAG,
-    "skip_connection": FLAG,
+    "head_input": one_of(["state", "trunk"]),
     "dueling": FLAG,
     "noisy": FLAG,
     "sigma_init": WEIGHT,

@@ -41,37 +41,32 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
         parameter.grad = gradient
 
 
-def branch(features: th.Tensor, state_dim: int, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def branch(features: th.Tensor, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Features for the TD loss and states for the auxiliary losses: the same numbers, but the gradients of both are told apart
-    where they meet, and the auxiliary one is scaled there so that its norm is at most a share of the TD loss's.
+    Features for the TD loss and for the auxiliary losses: the same numbers, but the gradients of both are told apart where
+    they meet, and the auxiliary one is scaled there so that its norm is at most a share of the TD loss's.
 
     :param features: (B, F)
-    :param state_dim: D ≤ F; states are the first D features
     :param share: ≥ 0; ``None``: nothing is scaled
     :param gram: (2, 2), filled in by the backward pass: the inner products of TD and auxiliary gradient
-    :return: (B, F) and (B, D)
+    :return: (B, F) twice
     """
-    return _Branch.apply(features, state_dim, share, gram)
+    return _Branch.apply(features, share, gram)
 
 
 class _Branch(th.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, features: th.Tensor, state_dim: int, share: float | None, gram: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def forward(ctx: Any, features: th.Tensor, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         ctx.share, ctx.gram = share, gram
-        return features.view_as(features), features[:, :state_dim].clone()
+        return features.view_as(features), features.view_as(features)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, of_td: th.Tensor, of_state: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        missing = of_td.shape[1] - of_state.shape[1]
-        auxiliary = nn.functional.pad(of_state, (0, missing)) if missing else of_state
-        both = th.stack([of_td.flatten(), auxiliary.flatten()])  # (2, B * F)
+    def backward(ctx: Any, of_td: th.Tensor, of_auxiliary: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        both = th.stack([of_td.flatten(), of_auxiliary.flatten()])  # (2, B * F)
         th.mm(both, both.mT, out=ctx.gram)
         if ctx.share is None:
-            return of_td + auxiliary, None, None, None
+            return of_td + of_auxiliary, None, None
         squares = ctx.gram.diagonal()
         scale = (ctx.share * (squares[0] / squares[1].clamp(min=1e-30)).sqrt()).clamp(max=1.0)
-        return th.addcmul(of_td, auxiliary, scale), None, None, None
+        return th.addcmul(of_td, of_auxiliary, scale), None, None

@@ -38,6 +38,7 @@ class LatentModel(nn.Module):
     :param hidden_dim: width of the hidden layer of r_ψ
     :param reward_loss: "mse" (Eq. 17) or "categorical" (three signs, as in the authors' released code)
     :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
+    :param embedding: from the encoder's features to states; ``None``: its features are the states
     :raises ValueError: for an unknown loss
     """
 
@@ -45,8 +46,17 @@ class LatentModel(nn.Module):
     projection: nn.Module  # likewise: b of the GET loss
     has_symmetry_loss = False
 
-    def __init__(self, state_dim: int, n_actions: int, hidden_dim: int, reward_loss: str, aet_loss: str):
+    def __init__(
+        self,
+        state_dim: int,
+        n_actions: int,
+        hidden_dim: int,
+        reward_loss: str,
+        aet_loss: str,
+        embedding: nn.Module | None = None,
+    ):
         super().__init__()
+        self.embedding = embedding or nn.Identity()  # its copy moves with the target
         for name, found, legal in (("reward_loss", reward_loss, REWARD_LOSSES), ("aet_loss", aet_loss, AET_LOSSES)):
             if found not in legal:
                 raise ValueError(f"{name}: expected one of {list(legal)}, found {found!r}")
@@ -122,6 +132,7 @@ class GroupLatentModel(LatentModel):
     :param reward_loss: as in :class:`LatentModel`
     :param aet_loss: likewise
     :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2
+    :param embedding: as in :class:`LatentModel`
     :raises ValueError: for an unknown loss
     """
 
@@ -134,10 +145,11 @@ class GroupLatentModel(LatentModel):
         reward_loss: str = "mse",
         aet_loss: str = "distance",
         state_dependent_actions: bool = True,
+        embedding: nn.Module | None = None,
     ):
         group = group.for_actions
         state_dim = n_blocks * prod(group.element_shape)
-        super().__init__(state_dim, n_actions, hidden_dim, reward_loss, aet_loss)
+        super().__init__(state_dim, n_actions, hidden_dim, reward_loss, aet_loss, embedding)
         self.group = group
         self.n_blocks = n_blocks
         self.has_symmetry_loss = group.has_inverse

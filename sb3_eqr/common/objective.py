@@ -56,8 +56,8 @@ class LossTerms(NamedTuple):
 class Following(NamedTuple):
     """What the objective needs of observations that carry no gradient."""
 
-    next_state: th.Tensor  # (B, D): by the target encoder, after the n-step transition; empty without TD loss
-    chooser_state: th.Tensor  # (B, D): the same by the encoder of the network that chooses the next action
+    next_features: th.Tensor  # (B, F): by the target encoder, after the n-step transition; empty without TD loss
+    chooser_features: th.Tensor  # (B, F): the same by the encoder of the network that chooses the next action
     start: th.Tensor  # (B, D): x̄₀
     rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, of the AET loss
 
@@ -91,15 +91,17 @@ class Objective:
         """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
         features = self.policy.online.features_extractor(observations)
-        # x₀, (B, D): TD and auxiliary losses meet here and nowhere else, so this is where their gradients are weighed.
-        state, gram = features[:, : self.policy.state_dim], None
+        # (B, F): TD and auxiliary losses meet here and nowhere else, so this is where their gradients are weighed.
+        for_head = for_state = features
+        gram = None
         if coefs.td > 0 and samples.mask is not None:
             gram = features.new_zeros(2, 2)
-            features, state = branch(features, self.policy.state_dim, self.aux_gradient_share, gram)
+            for_head, for_state = branch(features, self.aux_gradient_share, gram)
+        state = for_state if samples.mask is None else self.policy.latent_model.embedding(for_state)  # x₀, (B, D)
         following = self._encode_following(samples, observations, state, coefs)
         td = priorities = q_values = None
         if coefs.td > 0:
-            td, priorities, q_values = self._td_terms(samples, features, following)
+            td, priorities, q_values = self._td_terms(samples, for_head, following)
         latent = self._latent_losses(samples, state, following, coefs)
         terms = zip(coefs, (td, *latent), strict=True)
         weighted = [term if coef == 1 else coef * term for coef, term in terms if term is not None]
@@ -111,7 +113,7 @@ class Objective:
         self, samples: SequenceReplayBufferSamples, observations: PyTorchObs, state: th.Tensor, coefs: LossCoefs
     ) -> Following:
         """All that is encoded without gradient. The target copy sees s_t in the same augmentation as the online encoder."""
-        policy, dim = self.policy, self.policy.state_dim
+        policy, embedding = self.policy, self.policy.latent_model_target.embedding
         has_td, has_latent = coefs.td > 0, samples.mask is not None
         is_separate, as_online = policy.latent_target is not policy.target, policy.latent_target_encodes_as_online
         of_target = [self.augment(samples.next_observations)] if has_td else []
@@ -129,13 +131,13 @@ class Objective:
             passes = chain(encode(encoder, of_target), encode(latent_encoder, pieces))
         else:
             passes = encode(encoder, chain(of_target, pieces))  # one tensor for each of the batches
-        next_state = next(passes) if has_td else state.new_empty(0)
+        next_features = next(passes) if has_td else state.new_empty(0)
         if needs_chooser and chooser is None:
             chooser = next(passes)
-        start = next(passes)[:, :dim] if has_latent and not as_online else state.detach()
+        start = embedding(next(passes)) if has_latent and not as_online else state.detach()
         states = list(passes)
-        rolled = th.cat(states)[:, :dim].view(*samples.mask.shape, -1) if states and samples.mask is not None else None
-        return Following(next_state, next_state if chooser is None else chooser, start, rolled)
+        rolled = embedding(th.cat(states)).view(*samples.mask.shape, -1) if states and samples.mask is not None else None
+        return Following(next_features, next_features if chooser is None else chooser, start, rolled)
 
     def _td_terms(
         self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following
@@ -143,10 +145,10 @@ class Objective:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
         online, target, n_samples = self.policy.online, self.policy.target, len(state)
         # One pass of the online head, with one draw of noise, for both of its uses.
-        states = [state, following.chooser_state] if self.double_q else [state]
+        states = [state, following.chooser_features] if self.double_q else [state]
         outputs = online.head(th.cat(states), noisy=True)  # (B or 2 B, N, A)
         with th.no_grad():
-            next_outputs = target.head(following.next_state, noisy=True)  # (B, N, A)
+            next_outputs = target.head(following.next_features, noisy=True)  # (B, N, A)
             values = online.expectation(outputs.detach())  # (B or 2 B, A)
             next_values = values[n_samples:] if self.double_q else target.expectation(next_outputs)
             next_best = of_actions(next_outputs, next_values.argmax(dim=1, keepdim=True))  # (B, N)

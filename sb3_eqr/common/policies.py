@@ -20,6 +20,7 @@ from sb3_eqr.common.networks.encoders import (
     DEFAULT_GROUP,
     ConvTrunk,
     GroupFeaturesExtractor,
+    GroupLayer,
     ImageExtractor,
     NormalizedExtractor,
     find_trunk,
@@ -35,7 +36,7 @@ Module = TypeVar("Module", bound=nn.Module)
 Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
-OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "skip_connection", "dueling", "noisy"]
+OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "head_input", "dueling", "noisy"]
 OWN_ARGUMENTS += [
     "sigma_init",
     "transition",
@@ -79,8 +80,8 @@ class EqRPolicy(BasePolicy):
     :param whiten: whether the encoder's algebra parameters are whitened over the batch: states cannot collapse to a point, and
         blocks are driven apart; needs a group
     :param layer_norm: whether layer norm stands behind the trunk, with a group and without
-    :param skip_connection: whether the Q head sees the trunk's features beside the state; needs a group, and
-        ``projection="own"`` or "none" for the AET loss
+    :param head_input: what the Q head sees: "state", the group elements (the paper), or "trunk", the trunk's features, from
+        which the latent model makes the group elements for itself; the AET loss then needs ``projection="own"`` or "none"
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀
@@ -112,7 +113,7 @@ class EqRPolicy(BasePolicy):
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
     latent_network_target: EqRNetwork | None
-    state_dim: int  # D: what the latent model moves, the first features of the encoder
+    state_dim: int  # D: of what the latent model moves
 
     def __init__(
         self,
@@ -131,7 +132,7 @@ class EqRPolicy(BasePolicy):
         parameterization: str = "euler",
         whiten: bool = False,
         layer_norm: bool = False,
-        skip_connection: bool = False,
+        head_input: str = "state",
         dueling: bool = True,
         noisy: bool = True,
         sigma_init: float = 0.5,
@@ -155,11 +156,6 @@ class EqRPolicy(BasePolicy):
         check_arguments(given, POLICY)
         if whiten and group is None:
             raise ValueError("whiten: expected a group, whose parameters are whitened, found group=None. Pass whiten=False.")
-        if skip_connection and group is None:
-            raise ValueError(
-                "skip_connection: expected a group, beside whose elements the trunk's features stand, found group=None. "
-                "Pass skip_connection=False."
-            )
         if transition == "convolutional" and group is not None:
             raise ValueError(f'transition: expected group=None, whose features "convolutional" moves, found group={group!r}')
         self.group = group
@@ -167,7 +163,7 @@ class EqRPolicy(BasePolicy):
         self.parameterization = parameterization
         self.whiten = whiten
         self.layer_norm = layer_norm
-        self.skip_connection = skip_connection
+        self.head_input = head_input
         self.predictor = predictor
         self.latent_tau = latent_tau
         self.transition = transition
@@ -206,22 +202,14 @@ class EqRPolicy(BasePolicy):
         raise AttributeError(f"{type(self).__name__} must define `target`")
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """The given features extractor as trunk, the group encoder behind it; ``group=None`` leaves the trunk alone."""
+        """The given features extractor as trunk, and the group encoder behind it where the Q head sees group elements."""
         trunk_kwargs = dict(self.features_extractor_kwargs)
         if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
-        if self.group is None:
+        if self.group is None or self.head_input == "trunk":
             trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
             return NormalizedExtractor(trunk) if self.layer_norm else trunk
-        group_kwargs = {
-            "group": self.group,
-            "n_blocks": self.n_blocks,
-            "parameterization": self.parameterization,
-            "whiten": self.whiten,
-            "layer_norm": self.layer_norm,
-            "skip_connection": self.skip_connection,
-            "normalized_image": not self.normalize_images,
-        }
+        group_kwargs = {**self._group_kwargs, "layer_norm": self.layer_norm, "normalized_image": not self.normalize_images}
         if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
             return self.features_extractor_class(self.observation_space, **{**group_kwargs, **trunk_kwargs})
         return GroupFeaturesExtractor(
@@ -230,6 +218,18 @@ class EqRPolicy(BasePolicy):
             trunk_class=self.features_extractor_class,
             trunk_kwargs=trunk_kwargs,
         )
+
+    @property
+    def _group_kwargs(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("group", "n_blocks", "parameterization", "whiten")}
+
+    @property
+    def group_layer(self) -> GroupLayer | None:
+        """What makes group elements of features: in the encoder, or in the latent model; ``None`` without a group."""
+        for owner, name in ((self.online.features_extractor, "group_layer"), (self.latent_model, "embedding")):
+            if isinstance(found := getattr(owner, name, None), GroupLayer):
+                return found
+        return None
 
     def _make_network(self, network_class: type[Network], n_atoms: int, **kwargs: Any) -> Network:
         encoder, n_actions = self.make_features_extractor(), int(self.action_space.n)
@@ -261,7 +261,10 @@ class EqRPolicy(BasePolicy):
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
         depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
-        self._encoder_ignores_mode = not any(isinstance(module, depend_on_mode) for module in encoder.modules())
+        self._encoder_ignores_mode, self._states_ignore_mode = (
+            not any(isinstance(module, depend_on_mode) for part in parts for module in part.modules())
+            for parts in ([encoder], [encoder, self.latent_model.embedding])
+        )
         self._make_target_copies()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
@@ -270,28 +273,32 @@ class EqRPolicy(BasePolicy):
     @property
     def description(self) -> dict[str, str]:
         """What the shapes of parameters do not say, by name, in words that are saved in a model's file."""
-        encoder = self.online.features_extractor
-        return {"group": encoder.description if isinstance(encoder, GroupFeaturesExtractor) else "no group"}
+        return {"group": "no group" if self.group_layer is None else self.group_layer.description}
 
     def _make_latent_model(self, encoder: BaseFeaturesExtractor) -> LatentModel:
         sizes, losses = (int(self.action_space.n), self.latent_hidden_dim), (self.reward_loss, self.aet_loss)
         if self.transition == "convolutional":
             self.state_dim = encoder.features_dim
             return ConvLatentModel(map_shape(encoder), *sizes, *losses)
-        blocks: tuple[Group, int] = NoGroup(encoder.features_dim), 1
-        self.state_dim = encoder.features_dim
-        if isinstance(encoder, GroupFeaturesExtractor):
-            blocks, self.state_dim = (encoder.group, encoder.n_blocks), encoder.state_dim
-        return GroupLatentModel(*blocks, *sizes, *losses, self.state_dependent_actions)
+        if self.group is None:
+            self.state_dim = encoder.features_dim
+            blocks: tuple[Group, int] = NoGroup(encoder.features_dim), 1
+            return GroupLatentModel(*blocks, *sizes, *losses, self.state_dependent_actions)
+        layer = encoder.group_layer if isinstance(encoder, GroupFeaturesExtractor) else None
+        made = layer or GroupLayer(encoder.features_dim, **self._group_kwargs)
+        self.state_dim = made.state_dim
+        embedding = made if layer is None else None
+        return GroupLatentModel(made.group, made.n_blocks, *sizes, *losses, self.state_dependent_actions, embedding)
 
     def _make_target_copies(self) -> None:
         latents: list[tuple[nn.Module | None, nn.Module | None]] = [
             (self.latent_network_target and self.online, self.latent_network_target),
             (self.own_projection, self.own_projection_target),
+            (self.latent_model.embedding, self.latent_model_target.embedding),
             (self.latent_model.transition, self.latent_model_target.transition),
             (self.latent_model.projection, self.latent_model_target.projection),
         ]
-        pairs = [(online, target) for online, target in latents if online is not None and target is not None]
+        pairs = [(online, target) for online, target in latents if online and target and [*online.parameters()]]
         if self.latent_tau is None:
             self.target_copy = self.latent_target_copy = TargetCopy([(self.online, self.target), *pairs])
         else:
@@ -310,7 +317,7 @@ class EqRPolicy(BasePolicy):
     @property
     def latent_target_encodes_as_online(self) -> bool:
         """The same of the latent model's target."""
-        return self.latent_target_copy.is_exact and self._encoder_ignores_mode
+        return self.latent_target_copy.is_exact and self._states_ignore_mode
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """As PyTorch's, with the same parameters."""
@@ -329,9 +336,9 @@ class EqRPolicy(BasePolicy):
                 f"symmetry_coef: the GET loss needs a group with inverses, found group={self.group!r}. "
                 "Pass symmetry_coef=0 or another group."
             )
-        if aet and self.projection == "head" and self.skip_connection:
+        if aet and self.projection == "head" and isinstance(self.latent_model.embedding, GroupLayer):
             raise ValueError(
-                'projection: expected "own" or "none" beside skip_connection=True, whose Q head takes more than the state; '
+                'projection: expected "own" or "none" beside head_input="trunk", whose Q head takes no group elements; '
                 'found "head". Pass policy_kwargs={"projection": "own"}, or aet_coef=0.'
             )
         if aet and self.projection == "head" and not self.net_arch:

@@ -14,7 +14,7 @@ from sb3_eqr.common.save_util import find_file, is_whole_model, read_data
 from sb3_eqr.common.validation import check_same_parameters
 
 ENCODER = "features_extractor"
-LATENT_PARTS = ("transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
+LATENT_PARTS = ("embedding", "transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
 
 
 def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -36,14 +36,15 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
                 raise ValueError(
                     f"load_representation: expected the encoder, group and actions of this agent; {name}.{key} is "
                     f"{expected.get(key, 'missing')} here and {given.get(key, 'missing')} in the file. Build this agent with "
-                    "the policy_kwargs of that one (group, n_blocks, parameterization, whiten, trunk, latent_hidden_dim, "
+                    "the policy_kwargs of that one (head_input, group, n_blocks, parameterization, whiten, trunk, latent_hidden_dim, "
                     "state_dependent_actions), for the same observations and actions."
                 )
     for name, module in modules.items():
         module.load_state_dict(found[name])
         for parameter in module.parameters():
             policy.optimizer.state.pop(parameter, None)
-    policy.target.features_extractor.load_state_dict(found[ENCODER])
+    for network in {policy.target, policy.latent_target}:
+        network.features_extractor.load_state_dict(found[ENCODER])
     for name in LATENT_PARTS:
         if hasattr(policy.latent_model_target, name):
             getattr(policy.latent_model_target, name).load_state_dict(found[name])

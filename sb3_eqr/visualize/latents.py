@@ -163,7 +163,7 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     with th.no_grad(), eval_mode(model):
         for start in range(0, n, CHUNK):
             piece = _map(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
-            pieces.append(model.policy.online.features(piece)[:, : model.policy.state_dim])
+            pieces.append(model.policy.latent_model.embedding(model.policy.online.features(piece)))
     return th.cat(pieces)
 
 

@@ -126,7 +126,7 @@ def test_each_is_trained_as_the_table_says(name):
     if encoder_name is None:
         assert not isinstance(encoder, GroupFeaturesExtractor)
     else:
-        assert f"{encoder.group}^{encoder.n_blocks}" == encoder_name
+        assert f"{encoder.group_layer.group}^{encoder.group_layer.n_blocks}" == encoder_name
     noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
     assert noisy == (name not in ("drq", "eqr_bbf"))
     assert model.policy.latent_model.n_actions == 3

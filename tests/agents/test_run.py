@@ -137,8 +137,8 @@ def test_defaults_are_those_of_table_5(make):
     head = network.head
     assert (head.n_atoms, model.policy.net_arch, model.policy.sigma_init) == (51, [256], 0.5) and head.value is not None
     assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(0.5 / 72**0.5)  # σ₀ over the square root of the inputs
-    assert (str(encoder.group), encoder.n_blocks, encoder.features_dim) == ("SE(2)", 12, 72)
-    assert sum(p.numel() for p in encoder.to_algebra.parameters()) == (3136 + 1) * 36
+    assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks, encoder.features_dim) == ("SE(2)", 12, 72)
+    assert sum(p.numel() for p in encoder.group_layer.to_algebra.parameters()) == (3136 + 1) * 36
     assert model.policy.latent_model.transition[0].out_features == 256
     assert model.frame_stack == 4
 
@@ -161,9 +161,9 @@ def test_images_channels_first_and_last(make, shape):
 def test_group_keywords_reach_a_given_group_encoder(make):
     own = {"features_extractor_class": GroupFeaturesExtractor, "group": "SO(3)", "n_blocks": 2}
     encoder = make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor
-    assert (str(encoder.group), encoder.n_blocks) == ("SO(3)", 2)
+    assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks) == ("SO(3)", 2)
     own["features_extractor_kwargs"] = {"group": "T(2)"}
-    assert str(make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor.group) == "T(2)"
+    assert str(make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor.group_layer.group) == "T(2)"
     assert make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": None}).policy.latent_model.n_blocks == 32  # Table 5
 
 
@@ -209,10 +209,10 @@ def test_a_custom_extractor_becomes_the_trunk(make):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(46)
     encoder = model.policy.online.features_extractor
     assert isinstance(encoder, GroupFeaturesExtractor) and isinstance(encoder.trunk, TinyExtractor)
-    assert encoder.to_algebra.in_features == 7
+    assert encoder.group_layer.to_algebra.in_features == 7
     assert not model.policy.target_encodes_as_online  # batch norm: online features in train mode are no target features
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(46)
-    assert model.policy.online.features_extractor.to_algebra.in_features == 512
+    assert model.policy.online.features_extractor.group_layer.to_algebra.in_features == 512
 
 
 @pytest.mark.parametrize("algorithm", [QRDQN, DQN, PPO])
@@ -378,7 +378,7 @@ def test_a_schedule_may_move_n_and_gamma(make):
 def test_singular_states_of_gl_neither_stop_nor_poison_a_run(make):
     """Every state the zero matrix: no inverse anywhere."""
     model = make(ChainEnv(), policy_kwargs={"group": "GL(2)"})
-    encoder = model.policy.online.features_extractor.to_algebra
+    encoder = model.policy.online.features_extractor.group_layer.to_algebra
     th.nn.init.zeros_(encoder.weight)
     th.nn.init.zeros_(encoder.bias)
     model.policy.update_target(1.0)

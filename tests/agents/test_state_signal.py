@@ -10,7 +10,7 @@ from sb3_eqr.common.objective import LossCoefs
 from tests.toys import ChainEnv, ImageEnv
 
 SETTINGS = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "n_steps": 2, "prediction_depth": 3, "seed": 0}
-SKIP = {"skip_connection": True, "projection": "own", "layer_norm": True, "n_blocks": 4, "net_arch": [16]}
+ASIDE = {"head_input": "trunk", "projection": "own", "layer_norm": True, "n_blocks": 4, "net_arch": [16]}
 
 
 def trained(kind=EqRRainbow, env=None, **changes):
@@ -29,31 +29,36 @@ def test_layer_norm_gives_each_sample_mean_0_and_variance_1():
         np.testing.assert_allclose(features.std(axis=1), 1, atol=2e-2)  # ε of the norm
 
 
-def test_the_head_sees_the_trunk_beside_the_state():
-    model = trained(policy_kwargs=SKIP)
-    policy, encoder = model.policy, model.policy.online.features_extractor
+@pytest.mark.parametrize("latent_tau", [None, 1.0])
+def test_the_head_sees_the_trunk_and_the_latent_model_makes_the_state(latent_tau):
+    model = trained(policy_kwargs={**ASIDE, "latent_tau": latent_tau}, target_update_interval=1_000)
+    policy, layer = model.policy, model.policy.latent_model.embedding
     inputs = th.rand(5, 3)
-    features, trunk = encoder(inputs), encoder.trunk(inputs)
-    elements = encoder.group.element(encoder.to_algebra(trunk).view(5, 4, 3)).flatten(1)
-    assert th.equal(features, th.cat([elements, trunk], dim=1))
-    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == 4 * 6 + 3
+    features = policy.online.features_extractor(inputs)
+    np.testing.assert_allclose(features.detach().std(dim=1, correction=0), 1, atol=2e-2)  # layer norm, and no more
+    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == 3
+    elements = layer.group.element(layer.to_algebra(features).view(5, 4, 3)).flatten(1)
+    assert th.equal(layer(features), elements)
+    assert th.equal(policy.latent_model_target.embedding(features), elements) is (latent_tau == 1.0)  # its copy moves with it
 
 
-def test_a_skip_connection_needs_a_group_and_a_projection_of_its_own():
-    with pytest.raises(ValueError, match=r"expected a group.*found group=None"):
-        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True, "group": None})
-    with pytest.raises(ValueError, match=r'projection: expected "own" or "none" beside skip_connection=True.*found "head"'):
-        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"skip_connection": True})
+def test_a_head_on_the_trunk_needs_a_projection_of_its_own():
+    with pytest.raises(ValueError, match=r"head_input must be one of"):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"head_input": "both"})
+    with pytest.raises(ValueError, match=r'projection: expected "own" or "none" beside head_input="trunk".*found "head"'):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"head_input": "trunk"})
 
 
 @pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
 @pytest.mark.parametrize("share", [None, 0.05])
-def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share):
+@pytest.mark.parametrize("head_input", ["state", "trunk"])
+def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input):
     """From the losses one by one: each alone gives its gradient at the state and at the encoder's weights."""
     settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the one loss that draws partners
-    model = trained(kind, **settings, policy_kwargs={"layer_norm": True, "projection": "own", "noisy": False})
+    network = {"layer_norm": True, "projection": "own", "noisy": False, "head_input": head_input}
+    model = trained(kind, **settings, policy_kwargs=network)
     policy, samples = model.policy, model.replay_buffer.sample(8)
-    weight = policy.online.features_extractor.to_algebra.weight
+    weight = next(policy.online.features_extractor.parameters())  # of the layer norm
     states = []
     policy.online.features_extractor.register_forward_hook(
         lambda module, args, out: states.append(out) if out.requires_grad else None

@@ -37,7 +37,7 @@ def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, ta
     target, online = new.policy.latent_model_target, new.policy.latent_model
     assert th.equal(target.transition[0].weight, online.transition[0].weight)
     assert th.equal(
-        new.policy.target.features_extractor.to_algebra[0].weight, old.policy.online.features_extractor.to_algebra[0].weight
+        new.policy.target.features_extractor.group_layer.to_algebra[0].weight, old.policy.online.features_extractor.group_layer.to_algebra[0].weight
     )
     assert not any(p in new.policy.optimizer.state for m in representation(new.policy).values() for p in m.parameters())
     before = states(new)

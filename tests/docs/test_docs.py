@@ -214,6 +214,7 @@ def check_script(call, arguments):
         patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
         patch.setattr(zoo_command, "check_trained", lambda args: None)  # nothing is trained here
         patch.setattr(zoo_command, "check_trained_agent", lambda path: None)
+        patch.setattr(zoo_command, "check_runs", lambda arguments: None)
         for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # replaced for good by a command
             patch.setattr(module, name, getattr(module, name))
         patch.setattr("huggingface_sb3.push_to_hub.generate_metadata", None, raising=False)

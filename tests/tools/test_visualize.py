@@ -89,7 +89,7 @@ def trained():
 def collapse(model):
     """Every state is one, and κ is the identity."""
     with th.no_grad():
-        model.policy.online.features_extractor.to_algebra.weight.zero_()
+        model.policy.online.features_extractor.group_layer.to_algebra.weight.zero_()
         for parameter in model.policy.latent_model.transition[-1].parameters():
             parameter.zero_()
     return model
@@ -107,7 +107,7 @@ def by_hand():
     model = make_model(env=Ring(unwound=True), n_blocks=1)
     latent = model.policy.latent_model
     with th.no_grad():
-        to_algebra = model.policy.online.features_extractor.to_algebra
+        to_algebra = model.policy.online.features_extractor.group_layer.to_algebra
         to_algebra.weight.copy_(th.tensor([[1.0, 0.0]]))
         to_algebra.bias.zero_()
         for net in (latent.transition, latent.action_symmetry, latent.reward_net):

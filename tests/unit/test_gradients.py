@@ -156,12 +156,12 @@ def test_two_gradients_meet_at_the_state(share):
 
     features = encoder(inputs)
     of_td, of_auxiliary = (
-        th.autograd.grad(f, features, retain_graph=True)[0] for f in (td(features), auxiliary(features[:, :4]))
+        th.autograd.grad(f, features, retain_graph=True)[0] for f in (td(features), auxiliary(features))
     )
     ratio = (of_td.norm() / of_auxiliary.norm()).item()
     scale = 1.0 if share is None else min(1.0, share * ratio)
     expected = th.autograd.grad(features, encoder.weight, of_td + scale * of_auxiliary)
-    features, state = branch(encoder(inputs), 4, share, gram)
+    features, state = branch(encoder(inputs), share, gram)
     found = th.autograd.grad(td(features) + auxiliary(state), encoder.weight)
     same(found, expected)
     flat = th.stack([of_td.flatten(), of_auxiliary.flatten()])
@@ -170,6 +170,6 @@ def test_two_gradients_meet_at_the_state(share):
 
 def test_no_gradient_is_no_division_by_zero():
     features = th.randn(3, 2, requires_grad=True)
-    branched, state = branch(features, 2, 0.5, th.zeros(2, 2))
+    branched, state = branch(features, 0.5, th.zeros(2, 2))
     (found,) = th.autograd.grad(branched.sum() + 0 * state.sum(), features)
     assert th.equal(found, th.ones(3, 2))

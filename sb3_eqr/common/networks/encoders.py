@@ -243,20 +243,60 @@ class NormalizedExtractor(BaseFeaturesExtractor):
         return self.norm(self.trunk(observations))
 
 
-class GroupFeaturesExtractor(BaseFeaturesExtractor):
+class GroupLayer(nn.Module):
     """
-    A trunk, one linear layer to the Lie algebra, K group elements, flattened (τ_θ of Eq. 13, appendix B.4).
-    It is a plain SB3 features extractor: stock QRDQN, DQN and PPO take it as ``features_extractor_class``.
+    One linear layer to the Lie algebra, and the K group elements of it, flattened (Eq. 13, appendix B.4).
 
-    :param observation_space: any that the trunk takes
+    :param features_dim: F
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
     :param n_blocks: K ≥ 1; ``None``: 12, for T(n) 32 (Table 5), and 1 where the name counts its own blocks
         ("SE(2)^8 x SO(3)^4", "none")
     :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether the algebra parameters are whitened over the batch
         (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are driven apart
+    :raises ValueError: for an unknown group or a number of blocks below 1
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        group: str | Group = DEFAULT_GROUP,
+        n_blocks: int | None = None,
+        parameterization: str = "euler",
+        whiten: bool = False,
+    ):
+        super().__init__()
+        made = make_group(group, parameterization)
+        if n_blocks is None:
+            n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
+            n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
+        check_number("n_blocks", n_blocks, 1, whole=True)
+        self.group = made
+        self.n_blocks = n_blocks
+        self.state_dim = n_blocks * prod(made.element_shape)  # D
+        self.description = f"{made}^{n_blocks}, {parameterization}"  # shapes of parameters do not determine the group
+        n_params = n_blocks * made.num_params
+        self.to_algebra: nn.Module = nn.Linear(features_dim, n_params)
+        if whiten:
+            self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """Features, (B, F), to K flattened elements, (B, D)."""
+        params = self.to_algebra(features)  # (B, K * num_params)
+        return self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
+
+
+class GroupFeaturesExtractor(BaseFeaturesExtractor):
+    """
+    A trunk and a :class:`GroupLayer`: τ_θ of Eq. 13.
+    It is a plain SB3 features extractor: stock QRDQN, DQN and PPO take it as ``features_extractor_class``.
+
+    :param observation_space: any that the trunk takes
+    :param group: as in :class:`GroupLayer`, as the three below
+    :param n_blocks: K ≥ 1, or ``None``
+    :param parameterization: of rotations
+    :param whiten: whether the algebra parameters are whitened over the batch
     :param layer_norm: whether layer norm stands behind the trunk
-    :param skip_connection: whether the trunk's features follow the elements: a head behind them sees both
     :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
@@ -273,22 +313,12 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         parameterization: str = "euler",
         whiten: bool = False,
         layer_norm: bool = False,
-        skip_connection: bool = False,
         trunk_class: str | type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
         normalized_image: bool = False,
         features_dim: int | None = None,
     ):
-        made = make_group(group, parameterization)
-        if n_blocks is None:
-            n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
-            n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
-        check_number("n_blocks", n_blocks, 1, whole=True)
-        super().__init__(observation_space, n_blocks * prod(made.element_shape))
-        self.state_dim = self.features_dim  # D: of the elements alone
-        self.group = made
-        self.n_blocks = n_blocks
-        self.description = f"{made}^{n_blocks}, {parameterization}"  # shapes of parameters do not determine the group
+        super().__init__(observation_space, 1)  # its size is known below
         trunk_kwargs = dict(trunk_kwargs or {})
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
         is_default = trunk_class is None and found is not FlattenExtractor
@@ -298,20 +328,9 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
             trunk_kwargs["features_dim"] = features_dim
         trunk = found(observation_space, **trunk_kwargs)
         self.trunk: BaseFeaturesExtractor = NormalizedExtractor(trunk) if layer_norm else trunk
-        self.skip_connection = skip_connection
-        if skip_connection:
-            self._features_dim += trunk.features_dim
-        n_params = n_blocks * made.num_params
-        self.to_algebra: nn.Module = nn.Linear(self.trunk.features_dim, n_params)
-        if whiten:
-            self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
+        self.group_layer = GroupLayer(trunk.features_dim, group, n_blocks, parameterization, whiten)
+        self._features_dim = self.group_layer.state_dim
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """
-        Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, D), and behind them, with a
-        skip connection, the trunk's features: (B, features_dim).
-        """
-        features = self.trunk(observations)
-        params = self.to_algebra(features)  # (B, K * num_params)
-        elements = self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
-        return th.cat([elements, features], dim=1) if self.skip_connection else elements
+        """Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, features_dim)."""
+        return self.group_layer(self.trunk(observations))
