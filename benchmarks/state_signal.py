@@ -5,7 +5,7 @@ What the state x₀ says at initialisation, and whose gradient arrives there in 
 
 Spread over states: the root mean square distance from the mean state. Of logits: the standard deviation over states
 without noise, and over draws of the head's noise at one state, each the root mean square over atoms and actions. Gradients:
-norms at the state, medians over the updates (train/td_state_gradient, train/aux_state_gradient).
+norms where the losses meet, medians over the updates (train/td_state_gradient, train/aux_state_gradient).
 """
 
 import argparse
@@ -33,7 +33,7 @@ def signal(model: EqRRainbow, observations: np.ndarray) -> dict[str, float]:
     policy = model.policy
     policy.set_training_mode(False)
     features = policy.online.features(policy.obs_to_tensor(observations)[0])  # (N, F)
-    state = features[:, : policy.state_dim]
+    state = policy.latent_model.embedding(features)
     logits = policy.online.head(features)  # (N, atoms, A)
     draws = th.stack([policy.online.head(features[:1], noisy=True)[0] for _ in range(N_DRAWS)])
     return {

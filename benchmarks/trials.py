@@ -69,7 +69,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     th.set_num_threads(1)
     envs.register()
     agent = trial["agent"]
-    kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN}
+    kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN, "qrdqn": EqRQRDQN}
     arguments = {"buffer_size": steps, **trial.get("changes", {})}
     if game in WORLDS:
         env_id, env_kwargs = WORLDS[game]

@@ -147,6 +147,9 @@ def train_representation(
             "state_dependent_actions": state_dependent_actions,
             "aet_loss": aet_loss,
             "projection": "none",
+            "layer_norm": False,  # whitening does its work
+            "head_input": "state",
+            "latent_tau": None,
             "noisy": False,
             "dueling": False,
             "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's own: Table 5's stops small gradients

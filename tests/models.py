@@ -19,6 +19,13 @@ SMALL = {
 }
 N_ATOMS = 9
 
+# The paper's network, without what docs/gradients.md changes: policy_kwargs. FLAT: and without a trunk, for vectors.
+PAPER = {"layer_norm": False, "head_input": "state", "projection": "head", "latent_tau": None}
+PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
+# Parametrize a question that has an answer in both.
+NETWORKS = {"default": {}, "paper": PAPER}
+BOTH = pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
+
 
 @dataclass(frozen=True)
 class Maker:

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.common.env_state import capture, restore
-from sb3_eqr.common.files import atomic_folder
+from sb3_eqr.common.files import atomic_folder, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 
@@ -41,6 +41,7 @@ def write_checkpoint(
     env = model.get_env()
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
+    remove_leftovers(folder, f"{PREFIX}*")  # of other steps, too: nobody may come there again
     with _last_named(folder), atomic_folder(checkpoint) as partial:
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -97,6 +98,7 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     :return: the checkpoint and what stands in its manifest
     :raises ValueError: if there is none, or a file of it has changed
     """
+    remove_leftovers(path, f"{PREFIX}*")
     found = path if (path / MANIFEST).is_file() else next(reversed(find_checkpoints(path)), None)
     if found is None:
         raise ValueError(

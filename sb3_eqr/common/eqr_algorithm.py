@@ -82,7 +82,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         symmetry_coef: float = 1.0,
         reward_coef: float = 5.0,
         td_coef: float = 1.0,
-        aux_gradient_share: float | None = None,
+        aux_gradient_share: float | None = 1.0,
         double_q: bool = True,
         prioritized_replay: bool = True,
         shift_pixels: int = 4,

@@ -50,9 +50,11 @@ def atomic_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
         yield partial
         for found in [*partial.rglob("*"), partial]:
             _sync(found)
-        with contextlib.suppress(FileExistsError, NotADirectoryError):
-            if not path.exists():
-                os.rename(partial, path)
+        try:
+            os.rename(partial, path)
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR, errno.EACCES) or not path.exists():
+                raise
         _sync(path.parent)
 
 
@@ -62,7 +64,7 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
     An empty file or folder beside ``path`` whose name nobody else has, gone afterwards. As long as it is written, its process
     holds a lock of it: one without a lock is a leftover.
     """
-    _remove_leftovers(path)
+    remove_leftovers(path.parent, glob.escape(path.name))
     descriptor = None
     while descriptor is None:  # it may be taken for a leftover before it is locked
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
@@ -95,8 +97,14 @@ def _full_disk_named(path: pathlib.Path) -> Iterator[None]:
         raise OSError(errno.ENOSPC, f"No space left on the disk of {path.parent}: {path.name} {state}") from error
 
 
-def _remove_leftovers(path: pathlib.Path) -> None:
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.partial"):
+def remove_leftovers(folder: pathlib.Path, names: str) -> None:
+    """
+    Remove what killed processes have left in a folder; what is being written is locked, and stays.
+
+    :param folder: where they wrote
+    :param names: of what they wrote, as a pattern
+    """
+    for leftover in folder.glob(f".{names}.*.partial"):
         with contextlib.suppress(OSError):
             descriptor = _open(leftover)
             try:

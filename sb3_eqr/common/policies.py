@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
@@ -22,6 +22,7 @@ from sb3_eqr.common.networks.encoders import (
     GroupFeaturesExtractor,
     GroupLayer,
     ImageExtractor,
+    MlpExtractor,
     NormalizedExtractor,
     find_trunk,
 )
@@ -37,16 +38,8 @@ Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
 OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "head_input", "dueling", "noisy"]
-OWN_ARGUMENTS += [
-    "sigma_init",
-    "transition",
-    "latent_hidden_dim",
-    "projection",
-    "predictor",
-    "latent_tau",
-    "state_dependent_actions",
-]
-OWN_ARGUMENTS += ["act_with_target", "reward_loss", "aet_loss"]
+OWN_ARGUMENTS += ["sigma_init", "transition", "latent_hidden_dim", "projection", "predictor", "latent_tau"]
+OWN_ARGUMENTS += ["state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
 
 
 class EqRPolicy(BasePolicy):
@@ -63,8 +56,8 @@ class EqRPolicy(BasePolicy):
     :param net_arch: hidden sizes of the Q head; ``None``: [256] (appendix B.4)
     :param activation_fn: Activation function of the Q head
     :param features_extractor_class: the trunk; the group encoder is put behind it. Its class or its name: "nature" (the
-        paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``). ``None``: SB3's
-        ``FlattenExtractor`` (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
+        paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``), "mlp" (one layer of 256),
+        "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: its keyword arguments: those of
         :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", of ``ImpalaExtractor`` beside it for "impala"
     :param normalize_images: Whether to divide images by 255 (True by default)
@@ -104,7 +97,7 @@ class EqRPolicy(BasePolicy):
     :raises ValueError: for an argument out of its range
     """
 
-    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = MlpExtractor
     action_space: spaces.Discrete
     net_arch: list[int]
     activation_fn: type[nn.Module]
@@ -131,16 +124,16 @@ class EqRPolicy(BasePolicy):
         n_blocks: int | None = None,
         parameterization: str = "euler",
         whiten: bool = False,
-        layer_norm: bool = False,
-        head_input: str = "state",
+        layer_norm: bool = True,
+        head_input: str = "trunk",
         dueling: bool = True,
         noisy: bool = True,
         sigma_init: float = 0.5,
         transition: str = "group",
         latent_hidden_dim: int = 256,
-        projection: str = "head",
+        projection: str = "own",
         predictor: bool = False,
-        latent_tau: float | None = None,
+        latent_tau: float | None = 1.0,
         state_dependent_actions: bool = True,
         act_with_target: bool = False,
         reward_loss: str = "mse",
@@ -256,7 +249,6 @@ class EqRPolicy(BasePolicy):
             width = {"own": self.latent_hidden_dim, "head": self.online.head.projection_dim, "none": self.state_dim}
             self.predictor_net = nn.Linear(width[self.projection], width[self.projection]).to(self.device)
             parameters += self.predictor_net.parameters()
-        self.latent_network_target = None if self.latent_tau is None else _frozen_copy(self.online)
         for module in self.modules():
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
@@ -265,6 +257,8 @@ class EqRPolicy(BasePolicy):
             not any(isinstance(module, depend_on_mode) for part in parts for module in part.modules())
             for parts in ([encoder], [encoder, self.latent_model.embedding])
         )
+        is_online = self.latent_tau == 1 and self._states_ignore_mode  # a copy would have nothing of its own
+        self.latent_network_target = None if self.latent_tau is None or is_online else _frozen_copy(self.online)
         self._make_target_copies()
         # One optimiser: the learning-rate schedule and the save path are the inherited ones.
         self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
@@ -307,7 +301,9 @@ class EqRPolicy(BasePolicy):
     @property
     def latent_target(self) -> EqRNetwork:
         """The network whose encoder gives the latent model its targets."""
-        return self.latent_network_target or self.target
+        if self.latent_tau is None:
+            return self.target
+        return self.latent_network_target or self.online
 
     @property
     def target_encodes_as_online(self) -> bool:

@@ -99,7 +99,7 @@ def trunk_of(model):
 def test_our_extractors_take_features_dim(make, name):
     network = {"features_extractor_class": name, "features_extractor_kwargs": {"features_dim": 24}}
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(50)
-    assert model.policy.online.features_extractor.group_layer.to_algebra.in_features == 24
+    assert model.policy.group_layer.to_algebra.in_features == 24
     features = trunk_of(model)(th.rand(2, 1, 36, 36))
     assert features.shape == (2, 24) and (features >= 0).all()  # a ReLU, as in SB3's NatureCNN
     assert trunk_of(make(ImageEnv(), "CnnPolicy")).linear is None

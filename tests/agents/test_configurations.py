@@ -10,7 +10,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
-from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor, ImpalaTrunk
+from sb3_eqr.common.networks.encoders import ImpalaTrunk
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import configuration_files
@@ -32,6 +32,7 @@ EXPECTED = {
     "se2+aet+get": ("SE(2)^12", {"aet", "symmetry"}),
     "se2+aet+r+get": ("SE(2)^12", {"aet", "symmetry", "reward"}),
     "rainbow": (None, set()),
+    "qrdqn": (None, set()),
     "der": (None, set()),
     "drq": (None, set()),
     "spr": (None, {"aet"}),
@@ -122,11 +123,8 @@ def test_each_is_trained_as_the_table_says(name):
         assert found == (ResetSchedule.of(value) if key == "resets" else value)
     assert abs(model._n_updates - 10 * model.gradient_steps / model.train_freq.frequency) < 1
     assert isinstance(model.replay_buffer, PrioritizedSequenceReplayBuffer) == (name != "drq")
-    encoder = model.policy.online.features_extractor
-    if encoder_name is None:
-        assert not isinstance(encoder, GroupFeaturesExtractor)
-    else:
-        assert f"{encoder.group_layer.group}^{encoder.group_layer.n_blocks}" == encoder_name
+    encoder, layer = model.policy.online.features_extractor, model.policy.group_layer
+    assert (layer and f"{layer.group}^{layer.n_blocks}") == encoder_name
     noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
     assert noisy == (name not in ("drq", "eqr_bbf"))
     assert model.policy.latent_model.n_actions == 3
@@ -152,7 +150,7 @@ def test_eqr_bbf_is_the_recipe():
     """The figures of the paper, one by one, on the agent as it is built at full width."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
     model = EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf"), device="cpu")
-    trunk = model.policy.online.features_extractor.trunk
+    trunk = model.policy.online.features_extractor
     assert isinstance(trunk.trunk, ImpalaTrunk) and trunk.rescale and trunk.features_dim == 11 * 11 * 32 * 4
     head = model.policy.online.head
     assert head.value is not None and head.first[0].out_features == 2 * 2048 and head.n_atoms == 51

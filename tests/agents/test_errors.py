@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 from benchmarks.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
-from tests.models import EITHER, SMALL, loss_terms
+from tests.models import EITHER, PAPER, SMALL, loss_terms
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 
 
@@ -27,7 +27,7 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"policy_kwargs": {"n_blocks": 0}}, "n_blocks must be an integer >= 1( or None)?, got 0"),
         ({"policy_kwargs": {"n_blocks": 2.5}}, "n_blocks"),
         ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization: expected one of"),
-        ({"policy_kwargs": {"net_arch": []}}, "at least one hidden layer.*projection"),
+        ({"policy_kwargs": {**PAPER, "net_arch": []}}, "at least one hidden layer.*projection"),
         ({"policy_kwargs": {"group": "none"}}, "Pass symmetry_coef=0"),
         ({"prediction_depth": -1}, "prediction_depth must be an integer >= 0( or None)?, got -1"),
         ({"prediction_depth": 1.5}, "prediction_depth"),
@@ -75,7 +75,10 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
             {"policy_kwargs": {"optimizer_class": "AdamV"}},
             "optimizer_class: expected a class or a name in torch.optim.*'AdamV'",
         ),
-        ({"policy_kwargs": {"features_extractor_class": "resnet"}}, "expected a class or one of \\['nature', 'impala'\\]"),
+        (
+            {"policy_kwargs": {"features_extractor_class": "resnet"}},
+            "expected a class or one of \\['nature', 'impala', 'mlp', 'flatten'\\]",
+        ),
     ],
     ids=str,
 )

@@ -4,17 +4,19 @@ import pytest
 import torch as th
 from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
 from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.policies import EqRPolicy
+from tests.models import BOTH, PAPER, PAPER_FLAT
 from tests.toys import ChainEnv, ImageEnv
 
 OFF = {
     "aet_coef": 0.0,
     "symmetry_coef": 0.0,
     "reward_coef": 0.0,
+    "aux_gradient_share": None,
     "double_q": False,
     "prioritized_replay": False,
     "shift_pixels": 0,
@@ -60,7 +62,7 @@ def test_with_every_switch_off_it_is_qrdqn(n_envs, n_steps, max_grad_norm, tau):
     extra = {"n_steps": n_steps, "max_grad_norm": max_grad_norm, "tau": tau}
     env = [make_vec_env(ChainEnv, n_envs) for _ in range(2)]
     theirs = QRDQN("MlpPolicy", env[0], policy_kwargs=dict(NETWORK), **{**SHARED, **extra}).learn(300)
-    off = {"group": None, "features_extractor_class": FlattenExtractor, "dueling": False, "noisy": False}
+    off = {**PAPER_FLAT, "group": None, "dueling": False, "noisy": False}
     ours = EqRQRDQN("MlpPolicy", env[1], policy_kwargs={**NETWORK, **off}, **{**SHARED, **OFF, **extra}).learn(300)
     assert_same_networks(ours, theirs)
 
@@ -70,7 +72,7 @@ def test_on_images_too(extractor):
     shared = {**SHARED, "learning_starts": 40, "train_freq": 8, "gradient_steps": 1}
     trunk = {"features_extractor_class": extractor}
     theirs = QRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk}, **shared).learn(120)
-    off = {"group": None, "dueling": False, "noisy": False}
+    off = {**PAPER, "group": None, "dueling": False, "noisy": False}
     ours = EqRQRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk, **off}, **shared, **OFF).learn(120)
     assert_same_networks(ours, theirs)
 
@@ -80,7 +82,7 @@ def test_the_group_encoder_is_a_plain_features_extractor():
     encoder = {"group": "SE(2)", "n_blocks": 3}
     theirs_kwargs = {**NETWORK, "features_extractor_class": GroupFeaturesExtractor, "features_extractor_kwargs": encoder}
     theirs = QRDQN("MlpPolicy", ChainEnv(), policy_kwargs=theirs_kwargs, **SHARED).learn(200)
-    ours_kwargs = {**NETWORK, **encoder, "dueling": False, "noisy": False}
+    ours_kwargs = {**NETWORK, **encoder, **PAPER_FLAT, "dueling": False, "noisy": False}
     ours = EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs=ours_kwargs, **SHARED, **OFF).learn(200)
     assert_same_networks(ours, theirs)
 
@@ -106,13 +108,14 @@ def test_same_seed_twice_other_seed_once():
     assert not same_state(a, c)
 
 
-def test_sharing_the_target_pass_changes_no_number(monkeypatch):
+@BOTH
+def test_sharing_the_target_pass_changes_no_number(network, monkeypatch):
     """Where the target is a copy of the online networks, one pass serves both: a shortcut, not another algorithm."""
     models = []
     for shortcut in (True, False):
         settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}
-        model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={"noisy": False})
-        assert model.policy.target_encodes_as_online
+        model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={**network, "noisy": False})
+        assert model.policy.target_encodes_as_online and model.policy.latent_target_encodes_as_online
         monkeypatch.setattr(EqRPolicy, "target_encodes_as_online", shortcut)
         monkeypatch.setattr(EqRPolicy, "latent_target_encodes_as_online", shortcut)
         models.append(model.learn(70))

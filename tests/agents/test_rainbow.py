@@ -16,7 +16,7 @@ from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.common.update_monitor import UpdateMonitor
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
-from tests.models import MAKERS, loss_terms
+from tests.models import BOTH, MAKERS, PAPER, loss_terms
 from tests.toys import ChainEnv, ImageEnv
 
 make_rainbow = MAKERS[1]
@@ -209,7 +209,7 @@ def test_beta_may_fall(make):
 
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
 def test_a_reset_to_the_last_bit(make, alpha, projection):
-    network = {"projection": projection}
+    network = PAPER if projection == "head" else {"projection": projection}
     model = make(ChainEnv(), resets={"interval": 20, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(50)
     assert model._n_updates == 20 and model._resets.done == []  # the next update comes after a reset
     old = {name: p.clone() for name, p in model.policy.state_dict().items()}
@@ -237,7 +237,7 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
             kinds["perturbed"] += 1
     assert min(kinds.values()) > 0
     assert len(model.policy.optimizer.state) == 0
-    for online_part, target_part in model.policy.target_copy.pairs:  # the target follows
+    for online_part, target_part in (*model.policy.target_copy.pairs, *model.policy.latent_target_copy.pairs):  # they follow
         for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
             assert th.equal(a, b)
     before = {name: p.clone() for name, p in new.items()}
@@ -407,10 +407,11 @@ def test_weight_decay_reaches_matrices_only(make, name):
             p.fill_(1.0)
     optimizer.step()
     assert {p.ndim for p in model._trained} == {1, 2}
-    for key, p in [*model.policy.online.named_parameters(), *model.policy.latent_model.named_parameters()]:
+    parts = [model.policy.online, model.policy.latent_model, model.policy.own_projection]
+    for key, p in [named for part in parts for named in part.named_parameters()]:
         assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # noise would die out
     trained = {id(p) for group in optimizer.param_groups for p in group["params"]}
-    assert trained == {id(p) for p in [*model.policy.online.parameters(), *model.policy.latent_model.parameters()]}
+    assert trained == {id(p) for part in parts for p in part.parameters()}
     model.set_logger(configure(None, []))
     model.lr_schedule = lambda progress: 0.125
     model._update_learning_rate(optimizer)
@@ -449,12 +450,14 @@ def test_latents_are_scaled_to_the_unit_interval():
         assert found.amin() >= 0 and found.amax() <= 1 and (found.amax(dim=1) > 0.99).all() and found.shape[1] > 50
 
 
+@BOTH
 @pytest.mark.parametrize("group", ["SE(2)", None])
-def test_trunks_by_name(make, group):
-    network = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}, "group": group}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network, symmetry_coef=0.0).learn(60)
+def test_trunks_by_name(make, group, network):
+    trunk = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}}
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **trunk, "group": group}, symmetry_coef=0.0).learn(60)
     encoder = model.policy.online.features_extractor
-    assert isinstance(encoder if group is None else encoder.trunk, ImpalaExtractor)
+    alone = network is PAPER and group is None  # neither a norm nor group elements behind it
+    assert isinstance(encoder if alone else encoder.trunk, ImpalaExtractor)
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 

@@ -27,15 +27,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
-from sb3_eqr.common.networks.encoders import ConvExtractor
-from tests.models import EITHER, N_ATOMS, SMALL
+from sb3_eqr.common.networks.encoders import ConvExtractor, MlpExtractor, NormalizedExtractor
+from tests.models import BOTH, EITHER, N_ATOMS, PAPER, PAPER_FLAT, SMALL
 from tests.toys import ChainEnv, ImageEnv
 
 
+@BOTH
 @pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy", "MultiInputPolicy"])
-def test_every_policy_runs_and_every_part_learns(make, policy):
+def test_every_policy_runs_and_every_part_learns(make, policy, network):
     envs = {"MlpPolicy": ChainEnv, "CnnPolicy": ImageEnv, "MultiInputPolicy": SimpleMultiObsEnv}
-    model = make(envs[policy](), policy)
+    model = make(envs[policy](), policy, policy_kwargs=network)
     before = deepcopy(model.policy.state_dict())
     model.learn(46)
     after = model.policy.state_dict()
@@ -62,7 +63,11 @@ def test_every_policy_runs_and_every_part_learns(make, policy):
         {"policy_kwargs": {"dueling": False}},
         {"policy_kwargs": {"noisy": False}},
         {"policy_kwargs": {"net_arch": [], "projection": "own"}},
-        {"policy_kwargs": {"net_arch": []}, "aet_coef": 0},
+        {"policy_kwargs": {**PAPER, "net_arch": []}, "aet_coef": 0},
+        {"policy_kwargs": PAPER_FLAT, "aux_gradient_share": None},
+        {"policy_kwargs": {"head_input": "state"}},
+        {"policy_kwargs": {"layer_norm": False}},
+        {"policy_kwargs": {"latent_tau": None}, "tau": 0.01},
         {"policy_kwargs": {"group": "GL(2)"}},
         {"policy_kwargs": {"group": "SO(3)", "parameterization": "exp"}},
         {"policy_kwargs": {"group": "SE(2)^2 x SO(3)", "n_blocks": None}},
@@ -121,7 +126,9 @@ def test_the_learning_rate_schedule_reaches_the_latent_model(make):
 
 
 def test_defaults_are_those_of_table_5(make):
-    model = make.algorithm("CnnPolicy", VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4), device="cpu")
+    """And those of docs/gradients.md, in place of the paper's encoder."""
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
+    model = make.algorithm("CnnPolicy", env, device="cpu")
     assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
     assert (model.learning_starts, model.gradient_steps, model.n_steps, model.prediction_depth) == (2000, 2, 10, 5)
     assert (model.train_freq.frequency, model.train_freq.unit.value, model.tau) == (1, "step", 1.0)
@@ -132,15 +139,25 @@ def test_defaults_are_those_of_table_5(make):
     assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
     adam = model.policy.optimizer.defaults
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
-    network = model.policy.online
-    encoder = network.features_extractor
-    head = network.head
-    assert (head.n_atoms, model.policy.net_arch, model.policy.sigma_init) == (51, [256], 0.5) and head.value is not None
-    assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(0.5 / 72**0.5)  # σ₀ over the square root of the inputs
-    assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks, encoder.features_dim) == ("SE(2)", 12, 72)
-    assert sum(p.numel() for p in encoder.group_layer.to_algebra.parameters()) == (3136 + 1) * 36
-    assert model.policy.latent_model.transition[0].out_features == 256
-    assert model.frame_stack == 4
+    assert model.frame_stack == 4 and model.aux_gradient_share == 1.0
+    policy = model.policy
+    assert (policy.layer_norm, policy.head_input, policy.projection, policy.latent_tau) == (True, "trunk", "own", 1.0)
+    assert isinstance(policy.online.features_extractor, NormalizedExtractor)
+    assert isinstance(policy.online.features_extractor.trunk, ConvExtractor)
+    assert policy.own_projection.weight.shape == (256, 72) and policy.predictor_net is None
+    papers = make.algorithm("CnnPolicy", env, device="cpu", policy_kwargs=PAPER).policy
+    assert isinstance(papers.online.features_extractor.trunk, ConvExtractor) and papers.own_projection is None
+    for policy, n_features in ((model.policy, 3136), (papers, 72)):
+        head, layer = policy.online.head, policy.group_layer
+        assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], 0.5) and head.value is not None
+        # σ₀ over the square root of the inputs
+        assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(0.5 / n_features**0.5)
+        assert (str(layer.group), layer.n_blocks, policy.state_dim) == ("SE(2)", 12, 72)
+        assert policy.online.features_extractor.features_dim == n_features
+        assert sum(p.numel() for p in layer.to_algebra.parameters()) == (3136 + 1) * 36
+        assert policy.latent_model.transition[0].out_features == 256
+    vectors = make.algorithm("MlpPolicy", ChainEnv(), device="cpu").policy.online.features_extractor
+    assert isinstance(vectors.trunk, MlpExtractor) and vectors.features_dim == 256
 
 
 # ---------------------------------------------------------------------------------------------- observations
@@ -159,7 +176,7 @@ def test_images_channels_first_and_last(make, shape):
 
 
 def test_group_keywords_reach_a_given_group_encoder(make):
-    own = {"features_extractor_class": GroupFeaturesExtractor, "group": "SO(3)", "n_blocks": 2}
+    own = {**PAPER, "features_extractor_class": GroupFeaturesExtractor, "group": "SO(3)", "n_blocks": 2}
     encoder = make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor
     assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks) == ("SO(3)", 2)
     own["features_extractor_kwargs"] = {"group": "T(2)"}
@@ -171,7 +188,7 @@ def test_images_that_are_floats_already(make):
     env = ImageEnv((3, 40, 36), dtype=np.float32)
     model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(46)
     assert model.objective.augment.image_keys == [""]  # augmented like the others
-    policy_kwargs = {"normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
+    policy_kwargs = {**PAPER, "normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
     encoder = make(env, "CnnPolicy", policy_kwargs=policy_kwargs).policy.online.features_extractor
     assert isinstance(encoder.trunk, ConvExtractor)
     with pytest.raises(ValueError, match="normalize_images=False"):
@@ -204,15 +221,19 @@ def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
     assert model.predict(model.get_env().reset())[0].shape == (1,)
 
 
-def test_a_custom_extractor_becomes_the_trunk(make):
+@BOTH
+def test_a_custom_extractor_becomes_the_trunk(make, network):
     kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=kwargs).learn(46)
-    encoder = model.policy.online.features_extractor
-    assert isinstance(encoder, GroupFeaturesExtractor) and isinstance(encoder.trunk, TinyExtractor)
-    assert encoder.group_layer.to_algebra.in_features == 7
-    assert not model.policy.target_encodes_as_online  # batch norm: online features in train mode are no target features
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": NatureCNN}).learn(46)
-    assert model.policy.online.features_extractor.group_layer.to_algebra.in_features == 512
+    policy = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **kwargs}).learn(46).policy
+    encoder = policy.online.features_extractor
+    assert isinstance(encoder, GroupFeaturesExtractor if network is PAPER else NormalizedExtractor)
+    assert isinstance(encoder.trunk, TinyExtractor)
+    assert policy.group_layer.to_algebra.in_features == 7
+    # Batch norm: online features in train mode are no target features.
+    assert not policy.target_encodes_as_online and not policy.latent_target_encodes_as_online
+    assert policy.latent_target is not policy.online
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, "features_extractor_class": NatureCNN}).learn(46)
+    assert model.policy.group_layer.to_algebra.in_features == 512
 
 
 @pytest.mark.parametrize("algorithm", [QRDQN, DQN, PPO])
@@ -319,14 +340,19 @@ def test_train_mode_reaches_all_that_is_trained_and_nothing_else(make):
         assert not any(m.training for m in [*policy.target.modules(), *policy.latent_model_target.modules()])
 
 
-def test_the_one_target_copy_follows(make):
-    model = make(ChainEnv()).learn(80)
-    pairs = model.policy.target_copy.pairs
-    assert len(pairs) == 3  # encoder with Q head, κ, b
+@BOTH
+def test_the_one_target_copy_follows(make, network):
+    policy = make(ChainEnv(), policy_kwargs=network).learn(80).policy
+    pairs = policy.target_copy.pairs
+    if network is PAPER:
+        assert len(pairs) == 3 and policy.latent_target_copy is policy.target_copy  # encoder with Q head, κ, b
+    else:
+        assert len(pairs) == 1 and len(policy.latent_target_copy.pairs) == 4  # p, to group elements, κ, b
+        pairs = [*pairs, *policy.latent_target_copy.pairs]
     for online, target in pairs:
         for a, b in zip(online.state_dict().values(), target.state_dict().values(), strict=True):
             assert th.equal(a, b) or a.dtype == th.int64  # num_batches_tracked is not used by inference
-    slow = make(ChainEnv(), tau=0.5)
+    slow = make(ChainEnv(), tau=0.5, policy_kwargs=network)
     before = [p.clone() for _, target in slow.policy.target_copy.pairs for p in target.parameters()]
     with th.no_grad():
         for online, _ in slow.policy.target_copy.pairs:
@@ -375,17 +401,21 @@ def test_a_schedule_may_move_n_and_gamma(make):
 # ---------------------------------------------------------------------------------------------- learning
 
 
-def test_singular_states_of_gl_neither_stop_nor_poison_a_run(make):
+@BOTH
+def test_singular_states_of_gl_neither_stop_nor_poison_a_run(make, network):
     """Every state the zero matrix: no inverse anywhere."""
-    model = make(ChainEnv(), policy_kwargs={"group": "GL(2)"})
-    encoder = model.policy.online.features_extractor.group_layer.to_algebra
-    th.nn.init.zeros_(encoder.weight)
-    th.nn.init.zeros_(encoder.bias)
-    model.policy.update_target(1.0)
-    assert (model.policy.online.features(th.rand(2, 3)) == 0).all()
+    model = make(ChainEnv(), policy_kwargs={**network, "group": "GL(2)"})
+    policy, to_algebra = model.policy, model.policy.group_layer.to_algebra
+    th.nn.init.zeros_(to_algebra.weight)
+    th.nn.init.zeros_(to_algebra.bias)
+    for copy in (policy.target_copy, policy.latent_target_copy):
+        copy.update(1.0)
+    observations = th.rand(2, 3)
+    assert (policy.latent_model.embedding(policy.online.features(observations)) == 0).all()
+    assert (policy.latent_model_target.embedding(policy.latent_target.features(observations)) == 0).all()
     model.learn(100)
-    assert model._n_updates > 0 and all(th.isfinite(p).all() for p in model.policy.parameters())
-    assert (encoder.weight != 0).any()
+    assert model._n_updates > 0 and all(th.isfinite(p).all() for p in policy.parameters())
+    assert (to_algebra.weight != 0).any()
 
 
 @EITHER

@@ -1,5 +1,7 @@
 """What enters the latent model, and the gradients that meet at the state."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
@@ -10,7 +12,7 @@ from sb3_eqr.common.objective import LossCoefs
 from tests.toys import ChainEnv, ImageEnv
 
 SETTINGS = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "n_steps": 2, "prediction_depth": 3, "seed": 0}
-ASIDE = {"head_input": "trunk", "projection": "own", "layer_norm": True, "n_blocks": 4, "net_arch": [16]}
+SMALL_NETWORK = {"n_blocks": 4, "net_arch": [16]}
 
 
 def trained(kind=EqRRainbow, env=None, **changes):
@@ -18,12 +20,10 @@ def trained(kind=EqRRainbow, env=None, **changes):
 
 
 def test_layer_norm_gives_each_sample_mean_0_and_variance_1():
-    for group in ("SE(2)", None):
-        model = EqRQRDQN(
-            "CnnPolicy", ImageEnv(), **{**SETTINGS, "symmetry_coef": 0.0}, policy_kwargs={"layer_norm": True, "group": group}
-        )
+    for network in ({}, {"group": None}, {"head_input": "state"}):
+        model = EqRQRDQN("CnnPolicy", ImageEnv(), **{**SETTINGS, "symmetry_coef": 0.0}, policy_kwargs=network)
         encoder = model.policy.online.features_extractor
-        trunk = encoder if group is None else encoder.trunk
+        trunk = encoder.trunk if "head_input" in network else encoder
         features = trunk(th.rand(5, 1, 36, 36)).detach().numpy()
         np.testing.assert_allclose(features.mean(axis=1), 0, atol=1e-6)
         np.testing.assert_allclose(features.std(axis=1), 1, atol=2e-2)  # ε of the norm
@@ -31,12 +31,12 @@ def test_layer_norm_gives_each_sample_mean_0_and_variance_1():
 
 @pytest.mark.parametrize("latent_tau", [None, 1.0])
 def test_the_head_sees_the_trunk_and_the_latent_model_makes_the_state(latent_tau):
-    model = trained(policy_kwargs={**ASIDE, "latent_tau": latent_tau}, target_update_interval=1_000)
+    model = trained(policy_kwargs={**SMALL_NETWORK, "latent_tau": latent_tau}, target_update_interval=1_000)
     policy, layer = model.policy, model.policy.latent_model.embedding
     inputs = th.rand(5, 3)
     features = policy.online.features_extractor(inputs)
     np.testing.assert_allclose(features.detach().std(dim=1, correction=0), 1, atol=2e-2)  # layer norm, and no more
-    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == 3
+    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == features.shape[1] == 256
     elements = layer.group.element(layer.to_algebra(features).view(5, 4, 3)).flatten(1)
     assert th.equal(layer(features), elements)
     assert th.equal(policy.latent_model_target.embedding(features), elements) is (latent_tau == 1.0)  # its copy moves with it
@@ -46,7 +46,7 @@ def test_a_head_on_the_trunk_needs_a_projection_of_its_own():
     with pytest.raises(ValueError, match=r"head_input must be one of"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"head_input": "both"})
     with pytest.raises(ValueError, match=r'projection: expected "own" or "none" beside head_input="trunk".*found "head"'):
-        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"head_input": "trunk"})
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "head"})
 
 
 @pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
@@ -91,35 +91,47 @@ def test_the_gradients_are_logged():
     )
 
 
-@pytest.mark.parametrize("latent_tau", [1.0, 0.25])
-def test_the_latent_target_moves_by_itself(latent_tau):
-    model = trained(policy_kwargs={"latent_tau": latent_tau}, target_update_interval=1_000)
+@pytest.mark.parametrize("latent_tau, whiten", [(1.0, False), (1.0, True), (0.25, False)])
+def test_the_latent_target_moves_by_itself(latent_tau, whiten):
+    model = trained(policy_kwargs={"latent_tau": latent_tau, "whiten": whiten}, target_update_interval=1_000)
     policy = model.policy
+    assert (policy.latent_target is policy.online) == (latent_tau == 1.0 and not whiten)  # else it is a copy
     q_target = [p.clone() for p in policy.target.parameters()]
-    latent = [(p.clone(), q) for q, p in zip(policy.online.parameters(), policy.latent_target.parameters(), strict=True)]
+    pairs = [(policy.online, policy.latent_target), *policy.latent_target_copy.pairs]
+    parameters = [pair for online, target in pairs for pair in zip(online.parameters(), target.parameters(), strict=True)]
+    before = [target.clone() for _, target in parameters]
     with th.no_grad():
-        for p in policy.online.parameters():
-            p.add_(1.0)
+        for part in (policy.online, policy.latent_model, policy.own_projection):
+            for p in part.parameters():
+                p.add_(1.0)
     policy.after_gradient_step()
     assert all(th.equal(a, b) for a, b in zip(q_target, policy.target.parameters(), strict=True))
-    for (before, online), after in zip(latent, policy.latent_target.parameters(), strict=True):
-        th.testing.assert_close(after, before + latent_tau * (online - before))
+    for (online, after), old in zip(parameters, before, strict=True):
+        th.testing.assert_close(after, old + latent_tau * (online - old))
 
 
-def test_a_copied_latent_target_is_the_online_encoder(monkeypatch):
-    """With latent_tau=1 one pass of the online encoder gives x̄₀, too: a shortcut, not another algorithm."""
+@pytest.mark.parametrize("head_input", ["trunk", "state"])
+def test_a_copied_latent_target_is_the_online_encoder(head_input, monkeypatch):
+    """With latent_tau=1 the online encoder gives x̄₀ ... x̄_M, and x̄₀ in the pass of x₀: shortcuts, not another algorithm."""
     states = []
+    network = {"latent_tau": 1.0, "noisy": False, "head_input": head_input}
     for shortcut in (True, False):
+        model = EqRRainbow("MlpPolicy", ChainEnv(), **SETTINGS, target_update_interval=20, policy_kwargs=network)
+        policy = model.policy
+        assert policy.latent_target is policy.online and policy.latent_target_encodes_as_online
         if not shortcut:
+            policy.latent_network_target = deepcopy(policy.online).requires_grad_(False).eval()
+            policy._make_target_copies()
+            assert policy.latent_target is not policy.online
             monkeypatch.setattr("sb3_eqr.common.policies.EqRPolicy.latent_target_encodes_as_online", False)
-        model = trained(policy_kwargs={"latent_tau": 1.0, "noisy": False}, target_update_interval=20)
-        states.append(model.policy.state_dict())
+        states.append(model.learn(60).policy.state_dict())
     assert all(th.equal(states[0][key], states[1][key]) for key in states[0])
 
 
 @pytest.mark.parametrize("projection", ["head", "own", "none"])
 def test_the_predictor_stands_on_the_online_side_alone(projection):
-    model = trained(policy_kwargs={"projection": projection, "predictor": True, "latent_tau": 1.0})
+    head_input = "state" if projection == "head" else "trunk"
+    model = trained(policy_kwargs={"projection": projection, "predictor": True, "head_input": head_input})
     policy = model.policy
     rows = th.randn(5, policy.state_dim)
     same = policy._projections(policy.online, policy.own_projection)(rows)
@@ -144,7 +156,7 @@ def test_spr_learns_saves_and_loads(tmp_path):
 def test_a_convolutional_transition_needs_a_map():
     with pytest.raises(ValueError, match=r"transition: expected group=None"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional"})
-    with pytest.raises(ValueError, match=r'"convolutional" expected an image trunk.*found FlattenExtractor'):
+    with pytest.raises(ValueError, match=r'"convolutional" expected an image trunk.*found MlpExtractor'):
         EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs={"transition": "convolutional", "group": None})
     with pytest.raises(ValueError, match=r"symmetry_coef: the GET loss needs"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional", "group": None})

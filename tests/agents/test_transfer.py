@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.transfer import representation
-from tests.models import MAKERS
+from tests.models import BOTH, MAKERS
 from tests.toys import ChainEnv
 
 QRDQN, RAINBOW = MAKERS
@@ -22,11 +22,13 @@ def same(one, other):
     return all(th.equal(one[name][key], other[name][key]) for name in one for key in one[name])
 
 
+@BOTH
 @pytest.mark.parametrize("giver, taker", [(QRDQN, RAINBOW), (RAINBOW, QRDQN), (QRDQN, QRDQN)])
-def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, taker):
-    old = giver(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46)
+def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, taker, network):
+    network = {**WHITENED, **network}
+    old = giver(ChainEnv(), policy_kwargs=network, seed=1).learn(46)
     old.save(tmp_path / "old")
-    new = taker(ChainEnv(), policy_kwargs=WHITENED).learn(46)
+    new = taker(ChainEnv(), policy_kwargs=network).learn(46)
     head = {k: v.clone() for k, v in new.policy.online.head.state_dict().items()}
     rewards = [p.clone() for p in new.policy.latent_model.reward_net.parameters()]
     assert not same(states(old), states(new))
@@ -36,9 +38,13 @@ def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, ta
     assert all(th.equal(p, q) for p, q in zip(new.policy.latent_model.reward_net.parameters(), rewards, strict=True))
     target, online = new.policy.latent_model_target, new.policy.latent_model
     assert th.equal(target.transition[0].weight, online.transition[0].weight)
-    assert th.equal(
-        new.policy.target.features_extractor.group_layer.to_algebra[0].weight, old.policy.online.features_extractor.group_layer.to_algebra[0].weight
-    )
+    for part in (new.policy.target, new.policy.latent_target):
+        taken, given = part.features_extractor.state_dict(), old.policy.online.features_extractor.state_dict()
+        assert all(th.equal(v, taken[k]) for k, v in given.items()) and len(taken) > 0
+    given = old.policy.latent_model.embedding.state_dict()
+    assert all(th.equal(v, target.embedding.state_dict()[k]) for k, v in given.items())
+    weights = new.policy.group_layer.to_algebra[0].weight, old.policy.group_layer.to_algebra[0].weight
+    assert th.equal(*weights)
     assert not any(p in new.policy.optimizer.state for m in representation(new.policy).values() for p in m.parameters())
     before = states(new)
     new.learn(8, reset_num_timesteps=False)
@@ -107,11 +113,15 @@ def test_files_that_are_no_agents(tmp_path):
         QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
 
 
-def test_states_are_the_same_in_another_agent(tmp_path):
+@BOTH
+def test_states_are_the_same_in_another_agent(tmp_path, network):
     """To the bit, wherever they are computed."""
-    old = QRDQN(ChainEnv(), seed=1).learn(46)
+    old = QRDQN(ChainEnv(), seed=1, policy_kwargs=network).learn(46)
     old.save(tmp_path / "old")
-    new = RAINBOW(ChainEnv(), seed=5).load_representation(tmp_path / "old")
+    new = RAINBOW(ChainEnv(), seed=5, policy_kwargs=network).load_representation(tmp_path / "old")
     observations = th.as_tensor(np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32))
-    for part in ("online", "target"):
-        assert th.equal(old.policy.online.features(observations), getattr(new.policy, part).features(observations))
+    features = old.policy.online.features(observations)
+    for part in (new.policy.online, new.policy.target, new.policy.latent_target):
+        assert th.equal(features, part.features(observations))
+    for model in (new.policy.latent_model, new.policy.latent_model_target):
+        assert th.equal(old.policy.latent_model.embedding(features), model.embedding(features))

@@ -7,7 +7,8 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common import objective
-from tests.models import MAKERS, loss_terms, train_on
+from sb3_eqr.common.networks.encoders import NormalizedExtractor
+from tests.models import MAKERS, PAPER, loss_terms, train_on
 from tests.toys import ChainEnv, ImageEnv
 
 
@@ -83,9 +84,10 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
         assert td.q_values[b].item() == pytest.approx(np.exp(current) @ support, rel=1e-5, abs=1e-6)
 
 
-def test_target_states_reach_the_latent_model_in_order(make, monkeypatch):
+@pytest.mark.parametrize("network", [PAPER, {}, {"latent_tau": 0.25}], ids=["paper", "default", "slow latent target"])
+def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, network):
     """The online and target encodings of s_t, s_{t+1} ... s_{t+M}, each in its place."""
-    model = trained_model(make)
+    model = trained_model(make, policy_kwargs=network)
     samples = model.replay_buffer.sample(8)
     seen = {}
     forward = type(model.policy.latent_model).forward
@@ -94,14 +96,21 @@ def test_target_states_reach_the_latent_model_in_order(make, monkeypatch):
     )
     loss_terms(model, samples)
     state, actions, rewards, mask, target_state, target_rollout = seen["args"][:6]
-    th.testing.assert_close(state, model.policy.online.features(samples.observations))
+    policy = model.policy
+
+    def expected_states(observations):
+        return policy.latent_model_target.embedding(policy.latent_target.features(observations)).detach()
+
+    encoded = policy.latent_model.embedding(policy.online.features(samples.observations))
+    th.testing.assert_close(state, encoded)
+    # Where the target is another network, its states are others, or the test says nothing.
+    assert (policy.latent_target is policy.online) == (network == {})
+    assert th.allclose(encoded, expected_states(samples.observations)) == (network == {})
     assert actions is samples.rollout_actions and rewards is samples.rollout_rewards and mask is samples.mask
     assert target_rollout.shape[1] == 2 and not target_rollout.requires_grad and not target_state.requires_grad
-    target = model.policy.target
-    th.testing.assert_close(target_state, target.features(samples.observations).detach())
+    th.testing.assert_close(target_state, expected_states(samples.observations))
     for m in range(2):
-        expected = target.features(samples.rollout_observations[:, m]).detach()
-        th.testing.assert_close(target_rollout[:, m], expected)
+        th.testing.assert_close(target_rollout[:, m], expected_states(samples.rollout_observations[:, m]))
 
 
 def test_replay_weights_multiply_every_loss(make):
@@ -149,16 +158,18 @@ def test_gradients_are_clipped_together(make):
     assert latent < trained and {id(p) for p in model.policy.online.parameters()} < trained
 
 
-def test_one_features_pass_serves_both(make, monkeypatch):
-    model = make(ImageEnv(), "CnnPolicy").learn(44)
+@pytest.mark.parametrize("network, encoder", [(PAPER, GroupFeaturesExtractor), ({}, NormalizedExtractor)])
+def test_one_features_pass_serves_both(make, monkeypatch, network, encoder):
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(44)
     calls = []
-    forward = GroupFeaturesExtractor.forward
+    forward = encoder.forward
     watched = lambda self, obs: calls.append((self, len(obs))) or forward(self, obs)  # noqa: E731
-    monkeypatch.setattr(GroupFeaturesExtractor, "forward", watched)
+    monkeypatch.setattr(encoder, "forward", watched)
     model.train(1, 8)
     online, target = model.policy.online.features_extractor, model.policy.target.features_extractor
-    # s_t with gradient, then all that the target sees: s_{t+n} and M steps of rollout.
-    assert calls == [(online, 8), (target, 8 + 8 * 2)]
+    # s_t with gradient, then all that the target sees: s_{t+n} and M steps of rollout, in one pass where one network does.
+    following = [(target, 8 + 8 * 2)] if network else [(target, 8), (online, 8 * 2)]
+    assert calls == [(online, 8), *following]
 
 
 @pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])

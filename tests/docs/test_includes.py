@@ -50,8 +50,8 @@ PROMISES: dict[str, dict[str, Promise]] = {
             text=("`Objective.__call__`", "`reward_coef`", "`aet_coef`", "`symmetry_coef`", "`td_coef`", "$w_i$"),
         ),
         "sb3_eqr/common/gradients.py, _Branch.backward": Promise(
-            code=("th.mm(both, both.mT, out=ctx.gram)", "ctx.share * ", "th.addcmul(of_td, auxiliary, scale)"),
-            text=("`branch`", "`aux_gradient_share=0.3`", "`train/td_state_gradient`"),
+            code=("th.mm(both, both.mT, out=ctx.gram)", "ctx.share * ", "th.addcmul(of_td, of_auxiliary, scale)"),
+            text=("`branch`", "`aux_gradient_share=1.0`", "`train/td_state_gradient`"),
         ),
         "sb3_eqr/common/rollout.py, _Rollout.forward": Promise(
             code=("th.addmm(offset, states[-1], transposed)", "group.act_vjp(params.view(", "th.stack(states[1:], dim=1)"),

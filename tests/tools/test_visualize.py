@@ -25,6 +25,7 @@ from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import encode, play
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, rewards_figure
 from sb3_eqr.visualize.tables import all_tables
+from tests.models import PAPER_FLAT
 
 STEP = 0.4
 FILES = ("transition", "motion", "generators", "disentanglement", "action_symmetry", "collapse", "rewards", "summary")
@@ -89,7 +90,7 @@ def trained():
 def collapse(model):
     """Every state is one, and κ is the identity."""
     with th.no_grad():
-        model.policy.online.features_extractor.group_layer.to_algebra.weight.zero_()
+        model.policy.group_layer.to_algebra.weight.zero_()
         for parameter in model.policy.latent_model.transition[-1].parameters():
             parameter.zero_()
     return model
@@ -104,10 +105,10 @@ def test_three_agents_three_verdicts(trained):
 
 def by_hand():
     """x = R(angle), κ(x, a) = R(±0.4), ρ = 1, r = 0: exact where the angle is seen unwound."""
-    model = make_model(env=Ring(unwound=True), n_blocks=1)
+    model = make_model(env=Ring(unwound=True), n_blocks=1, network=PAPER_FLAT)
     latent = model.policy.latent_model
     with th.no_grad():
-        to_algebra = model.policy.online.features_extractor.group_layer.to_algebra
+        to_algebra = model.policy.group_layer.to_algebra
         to_algebra.weight.copy_(th.tensor([[1.0, 0.0]]))
         to_algebra.bias.zero_()
         for net in (latent.transition, latent.action_symmetry, latent.reward_net):

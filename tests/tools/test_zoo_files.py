@@ -45,15 +45,19 @@ class Manager(ExperimentManager):
 
 
 def algorithm_of(name):
-    return name.removeprefix("stock/") if name.startswith("stock/") else name if name == "eqr_qrdqn" else "eqr_rainbow"
+    if name.startswith("stock/"):
+        return name.removeprefix("stock/")
+    return "eqr_qrdqn" if name in ("eqr_qrdqn", "qrdqn") else "eqr_rainbow"
 
 
 def test_every_file_has_its_environments():
     full = {"eqr_qrdqn", "eqr_rainbow", "stock/dqn", "stock/qrdqn"}
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS} == full
     minatar = {"atari", *(env_id for env_id in ENVIRONMENTS if env_id.startswith("MinAtar/"))}
-    assert ENTRIES["rainbow"].keys() == minatar and len({id(ENTRIES["rainbow"][env_id]) for env_id in minatar}) == 2
-    assert all(entries.keys() == {"atari"} for name, entries in ENTRIES.items() if name not in {*full, "rainbow"})
+    rivals = {"qrdqn", "rainbow", "spr"}
+    for name in rivals:
+        assert ENTRIES[name].keys() == minatar and len({id(ENTRIES[name][env_id]) for env_id in minatar}) == 2
+    assert all(entries.keys() == {"atari"} for name, entries in ENTRIES.items() if name not in full | rivals)
 
 
 @pytest.mark.parametrize("name, entry", CASES, ids=lambda value: value)

@@ -155,9 +155,7 @@ def test_two_gradients_meet_at_the_state(share):
         return 7 * state.square().sum()
 
     features = encoder(inputs)
-    of_td, of_auxiliary = (
-        th.autograd.grad(f, features, retain_graph=True)[0] for f in (td(features), auxiliary(features))
-    )
+    of_td, of_auxiliary = (th.autograd.grad(f, features, retain_graph=True)[0] for f in (td(features), auxiliary(features)))
     ratio = (of_td.norm() / of_auxiliary.norm()).item()
     scale = 1.0 if share is None else min(1.0, share * ratio)
     expected = th.autograd.grad(features, encoder.weight, of_td + scale * of_auxiliary)

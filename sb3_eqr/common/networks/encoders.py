@@ -204,8 +204,33 @@ class ImpalaExtractor(ImageExtractor):
         super().__init__(observation_space, make_trunk, 1, features_dim, normalized_image, rescale)
 
 
+class MlpExtractor(BaseFeaturesExtractor):
+    """
+    Observations flattened, one linear layer and its ReLU: a trunk for vectors, in which Q-learning and latent model can share
+    something that is trained.
+
+    :param observation_space: any but dictionaries
+    :param features_dim: size of the layer
+    """
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
+        check_number("features_dim", features_dim, 1, whole=True)
+        super().__init__(observation_space, features_dim)
+        flat = FlattenExtractor(observation_space)
+        self.layers = nn.Sequential(flat, nn.Linear(flat.features_dim, features_dim), nn.ReLU())
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(B, *obs_shape) to (B, features_dim)."""
+        return self.layers(observations)
+
+
 # Names for files that hold plain strings only.
-TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {"nature": ConvExtractor, "impala": ImpalaExtractor}
+TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {
+    "nature": ConvExtractor,
+    "impala": ImpalaExtractor,
+    "mlp": MlpExtractor,
+    "flatten": FlattenExtractor,
+}
 
 
 def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
@@ -297,7 +322,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param parameterization: of rotations
     :param whiten: whether the algebra parameters are whitened over the batch
     :param layer_norm: whether layer norm stands behind the trunk
-    :param trunk_class: features extractor in front of the linear layer, or its name ("nature", "impala"); ``None``: the
+    :param trunk_class: features extractor in front of the linear layer, or its name in ``TRUNKS``; ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
     :param normalized_image: as in SB3's extractors: images are floats already; reaches the default trunk
