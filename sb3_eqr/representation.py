@@ -150,6 +150,7 @@ def train_representation(
             "layer_norm": False,  # whitening does its work
             "head_input": "state",
             "latent_tau": None,
+            **({"features_extractor_class": "flatten"} if policy == "MlpPolicy" else {}),
             "noisy": False,
             "dueling": False,
             "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's own: Table 5's stops small gradients

@@ -199,11 +199,16 @@ class EqRPolicy(BasePolicy):
         trunk_kwargs = dict(self.features_extractor_kwargs)
         if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
+        is_encoder = issubclass(self.features_extractor_class, GroupFeaturesExtractor)
+        if is_encoder and self.group is not None and self.head_input == "trunk":
+            raise ValueError(
+                'features_extractor_class: expected a trunk, found a group encoder. Pass head_input="state" with it.'
+            )
         if self.group is None or self.head_input == "trunk":
             trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
             return NormalizedExtractor(trunk) if self.layer_norm else trunk
         group_kwargs = {**self._group_kwargs, "layer_norm": self.layer_norm, "normalized_image": not self.normalize_images}
-        if issubclass(self.features_extractor_class, GroupFeaturesExtractor):
+        if is_encoder:
             return self.features_extractor_class(self.observation_space, **{**group_kwargs, **trunk_kwargs})
         return GroupFeaturesExtractor(
             self.observation_space,
@@ -252,7 +257,7 @@ class EqRPolicy(BasePolicy):
         for module in self.modules():
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
-        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, Whitening)
+        depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, nn.RReLU, Whitening)
         self._encoder_ignores_mode, self._states_ignore_mode = (
             not any(isinstance(module, depend_on_mode) for part in parts for module in part.modules())
             for parts in ([encoder], [encoder, self.latent_model.embedding])

@@ -36,8 +36,8 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
                 raise ValueError(
                     f"load_representation: expected the encoder, group and actions of this agent; {name}.{key} is "
                     f"{expected.get(key, 'missing')} here and {given.get(key, 'missing')} in the file. Build this agent with "
-                    "the policy_kwargs of that one (head_input, group, n_blocks, parameterization, whiten, trunk, latent_hidden_dim, "
-                    "state_dependent_actions), for the same observations and actions."
+                    "the policy_kwargs of that one (head_input, group, n_blocks, parameterization, whiten, layer_norm, trunk, "
+                    "latent_hidden_dim, state_dependent_actions), for the same observations and actions."
                 )
     for name, module in modules.items():
         module.load_state_dict(found[name])

@@ -1,6 +1,6 @@
 """What each part of a diagnosis looks at: motion, generators, blocks, the action symmetry, collapse."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.losses import normalized_distance
-from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
+from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor, NormalizedExtractor
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import measures
 from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, group_model, split
@@ -174,8 +174,9 @@ def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchO
 
 def _activity(model: EqRAlgorithm, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """:return: least, greatest and mean absolute output of each unit of the trunk, (U,) each"""
-    extractor = model.policy.online.features_extractor
-    trunk = extractor.trunk if isinstance(extractor, GroupFeaturesExtractor) else extractor
+    trunk: Any = model.policy.online.features_extractor
+    while isinstance(trunk, (GroupFeaturesExtractor, NormalizedExtractor)):
+        trunk = trunk.trunk  # behind a layer norm, a unit that is always 0 is no constant
     seen: list[tuple[th.Tensor, th.Tensor, th.Tensor, int]] = []
 
     def note(_module: th.nn.Module, _inputs: tuple, output: th.Tensor) -> None:

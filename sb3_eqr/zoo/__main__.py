@@ -186,8 +186,6 @@ def run(command: str, arguments: list[str]) -> None:
     :param command: one of ``COMMANDS``
     :param arguments: RL Zoo's own, on its command line
     """
-    if command == "all_plots":
-        check_runs(arguments)
     sys.argv = [f"sb3-eqr {command}", *arguments]
     try:
         if command in PLOTS:
@@ -216,6 +214,8 @@ def run(command: str, arguments: list[str]) -> None:
 
 def prepare(command: str, arguments: list[str]) -> list[str]:
     """Check what a command is asked, before RL Zoo starts; returns what is left for RL Zoo."""
+    if command == "all_plots":
+        check_runs(arguments)
     if command in PLOTS:
         return arguments
     args = parse(arguments)

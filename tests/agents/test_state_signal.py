@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr import EqRQRDQN, EqRRainbow, GroupFeaturesExtractor
 from sb3_eqr.common.objective import LossCoefs
 from tests.toys import ChainEnv, ImageEnv
 
@@ -58,7 +58,7 @@ def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind,
     network = {"layer_norm": True, "projection": "own", "noisy": False, "head_input": head_input}
     model = trained(kind, **settings, policy_kwargs=network)
     policy, samples = model.policy, model.replay_buffer.sample(8)
-    weight = next(policy.online.features_extractor.parameters())  # of the layer norm
+    weight = next(policy.online.features_extractor.parameters())  # of the trunk
     states = []
     policy.online.features_extractor.register_forward_hook(
         lambda module, args, out: states.append(out) if out.requires_grad else None
@@ -162,3 +162,22 @@ def test_a_convolutional_transition_needs_a_map():
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional", "group": None})
     with pytest.raises(ValueError, match=r"transition must be one of"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"transition": "linear"})
+
+
+def test_a_group_encoder_is_no_trunk():
+    policy_kwargs = {"features_extractor_class": GroupFeaturesExtractor}
+    with pytest.raises(ValueError, match=r'expected a trunk, found a group encoder. Pass head_input="state"'):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=policy_kwargs)
+    model = EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={**policy_kwargs, "head_input": "state", "projection": "head"})
+    assert isinstance(model.policy.online.features_extractor, GroupFeaturesExtractor)
+
+
+def test_the_trunk_for_vectors():
+    model = trained()
+    trunk = model.policy.online.features_extractor.trunk
+    inputs = th.rand(5, 3)
+    weight, bias = trunk.layers[1].weight, trunk.layers[1].bias
+    assert weight.shape == (256, 3)
+    th.testing.assert_close(trunk(inputs), (inputs @ weight.T + bias).clamp(min=0))
+    with pytest.raises(ValueError, match=r"features_dim must be an integer >= 1"):
+        trained(policy_kwargs={"features_extractor_kwargs": {"features_dim": 0}})
