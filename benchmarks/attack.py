@@ -33,7 +33,11 @@ def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Cal
             lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=2),
             lambda: kills.killed_benchmark(folder / "benchmark", n_kills, rng),
         ],
-        "inputs": [inputs.wrong_arguments, lambda: command_lines.wrong_command_lines(folder / "lines")],
+        "inputs": [
+            inputs.wrong_arguments,
+            inputs.without_asserts,
+            lambda: command_lines.wrong_command_lines(folder / "lines"),
+        ],
         "numbers": [lambda: numbers.not_a_number(folder / "numbers")],
         "files": [
             lambda: files.strangers_files(folder / "hostile"),

@@ -2,6 +2,8 @@
 
 import contextlib
 import io
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -179,3 +181,11 @@ def wrong_arguments() -> Finding:
     wrong = [found for found in map(ask, cases) if found is not None]
     must = "all answered by name, expected, got; none silent, none over 5 s"
     return Finding(f"{len(cases)} wrong inputs", must, f"{len(cases) - len(wrong)} answered", not wrong, tuple(wrong))
+
+
+def without_asserts() -> Finding:
+    """The same in an interpreter that leaves assertions out."""
+    call = "from benchmarks.attacks.inputs import wrong_arguments as f; x = f(); print(x.found, *x.details, sep='\\n')"
+    done = subprocess.run([sys.executable, "-O", "-c", call], capture_output=True, text=True)
+    found, *wrong = done.stdout.strip().splitlines() or [done.stderr[-200:]]
+    return Finding("the same with python -O", "all answered", found, done.returncode == 0 and not wrong, tuple(wrong))

@@ -39,6 +39,15 @@ class Promise(NamedTuple):
 
 # page -> include -> promise, in the order of the page
 PROMISES: dict[str, dict[str, Promise]] = {
+    "configurations.md": {
+        "sb3_eqr/common/arguments.py, ALGORITHM: dict": Promise(
+            code=('"max_grad_norm": number(0, above=True) | NONE', '"seed": integer(0, 2**32 - 1) | NONE'),
+            text=("`ALGORITHM`", "`WEIGHT`", "`SHARE`", "`FLAG`"),
+        ),
+        "sb3_eqr/common/arguments.py, POLICY: dict": Promise(
+            code=('"projection": one_of(["head", "own", "none"])', '"n_quantiles": integer(1)'), text=("`POLICY`",)
+        ),
+    },
     "losses.md": {
         "sb3_eqr/common/objective.py, Objective.__call__": Promise(
             code=(
