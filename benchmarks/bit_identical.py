@@ -91,7 +91,13 @@ CONFIGURATIONS: dict[str, Configuration] = {
     "GET alone": ("rainbow", "vectors", 1, {"aet_coef": 0.0, "reward_coef": 0.0}, {}),
     "reward alone": ("qrdqn", "images", 1, {"aet_coef": 0.0, "symmetry_coef": 0.0}, {}),
     "signs of rewards": ("rainbow", "vectors", 1, {"aet_coef": 0.3}, {"reward_loss": "categorical"}),
-    "projections of its own": ("qrdqn", "images", 1, {}, {"projection": "own"}),
+    "paper's network": (
+        "qrdqn",
+        "images",
+        1,
+        {"aux_gradient_share": None},
+        {"projection": "head", "head_input": "state", "layer_norm": False, "latent_tau": None},
+    ),
     "representation alone": (
         "qrdqn",
         "images",

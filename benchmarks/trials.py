@@ -51,7 +51,10 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
+    from sb3_eqr.common.latent_model import GroupLatentModel
     from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+    from sb3_eqr.visualize.diagnostics import diagnose
+    from sb3_eqr.visualize.latents import replayed
 
     class Means(KVWriter):
         """Keeps what is logged, to take its mean."""
@@ -90,12 +93,17 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
         scores, _ = evaluate(model, protocol, 100, seed)
+    skill = {}
+    if getattr(model, "depth", 0) and isinstance(model.policy.latent_model, GroupLatentModel):
+        found = diagnose(model, replayed(model, 512, np.random.default_rng(seed)), seed)
+        skill = {"skill": [round(float(value), 3) for value in found.loss.skill]}  # one to M steps ahead
     curve = [float(np.mean(part)) for part in np.array_split(means.values["rollout/ep_rew_mean"], N_PARTS) if len(part)]
     logged = {key: float(np.median(values)) for key, values in means.values.items() if key.startswith("train/")}
     return {
         "score": float(np.mean(scores)),
         "seconds": round(seconds, 1),
         "curve": [round(value, 3) for value in curve],
+        **skill,
         "train": {key.removeprefix("train/"): float(f"{value:.4g}") for key, value in logged.items()},
     }
 
