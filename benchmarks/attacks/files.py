@@ -259,7 +259,7 @@ def full_disk(folder: pathlib.Path) -> Finding:
         try:
             model.learn(4_000, ExactCheckpointCallback(50, folder / "checkpoints", keep=1_000))
         except OSError as error:
-            said = str(error)
+            said = str(error).replace(str(folder), "FOLDER")
         resumed = EqRQRDQN.resume(folder / "checkpoints", make_vec_env("CartPole-v1"))
         left = [str(path) for path in folder.rglob(".*")]
         holds = (

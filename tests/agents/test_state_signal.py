@@ -7,8 +7,10 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, GroupFeaturesExtractor
+from benchmarks.state_signal import signal
+from sb3_eqr import EqRQRDQN, EqRRainbow, GroupFeaturesExtractor, load_configuration
 from sb3_eqr.common.objective import LossCoefs
+from sb3_eqr.envs import make_atari100k_env
 from tests.toys import ChainEnv, ImageEnv
 
 SETTINGS = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "n_steps": 2, "prediction_depth": 3, "seed": 0}
@@ -181,3 +183,13 @@ def test_the_trunk_for_vectors():
     th.testing.assert_close(trunk(inputs), (inputs @ weight.T + bias).clamp(min=0))
     with pytest.raises(ValueError, match=r"features_dim must be an integer >= 1"):
         trained(policy_kwargs={"features_extractor_kwargs": {"features_dim": 0}})
+
+
+@pytest.mark.parametrize("configuration, low, high", [("default", 0.2, np.inf), ("paper", 0.0, 0.01)])
+def test_the_logits_of_a_new_agent_tell_frames_apart(configuration, low, high):
+    """Their spread over frames of Krull beside that over draws of noise (docs/gradients.md has three games)."""
+    arguments = {} if configuration == "default" else load_configuration(configuration)
+    small = {"buffer_size": 400, "learning_starts": 300, "seed": 0}
+    model = EqRRainbow("CnnPolicy", make_atari100k_env("Krull", seed=0), **{**arguments, **small}).learn(200)
+    found = signal(model, model.replay_buffer.sample(64).observations.numpy())
+    assert low <= found["logits_over_states"] / found["logits_over_noise"] <= high
