@@ -20,7 +20,7 @@ SMALL = {
 N_ATOMS = 9
 
 # The paper's network, without what docs/gradients.md changes: policy_kwargs. FLAT: and without a trunk, for vectors.
-PAPER = {"layer_norm": False, "head_input": "state", "projection": "head", "latent_tau": None}
+PAPER = {"layer_norm": False, "head_input": "state", "projection": "head", "latent_tau": None, "sigma_init": 0.5}
 PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
 # Parametrize a question that has an answer in both.
 NETWORKS = {"default": {}, "paper": PAPER}

@@ -77,7 +77,7 @@ class EqRPolicy(BasePolicy):
         which the latent model makes the group elements for itself; the AET loss then needs ``projection="own"`` or "none"
     :param dueling: value and advantage streams
     :param noisy: factorised noisy layers in the head
-    :param sigma_init: their initial noise σ₀
+    :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243), where Table 5 has 0.5
     :param transition: how actions move states: "group", or "convolutional": SPR's network on the trunk's map of features
         (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), with ``group=None`` and an image trunk
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
@@ -128,7 +128,7 @@ class EqRPolicy(BasePolicy):
         head_input: str = "trunk",
         dueling: bool = True,
         noisy: bool = True,
-        sigma_init: float = 0.5,
+        sigma_init: float = 0.1,
         transition: str = "group",
         latent_hidden_dim: int = 256,
         projection: str = "own",

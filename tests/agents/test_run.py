@@ -147,11 +147,11 @@ def test_defaults_are_those_of_table_5(make):
     assert policy.own_projection.weight.shape == (256, 72) and policy.predictor_net is None
     papers = make.algorithm("CnnPolicy", env, device="cpu", policy_kwargs=PAPER).policy
     assert isinstance(papers.online.features_extractor.trunk, ConvExtractor) and papers.own_projection is None
-    for policy, n_features in ((model.policy, 3136), (papers, 72)):
+    for policy, n_features, sigma_init in ((model.policy, 3136, 0.1), (papers, 72, 0.5)):
         head, layer = policy.online.head, policy.group_layer
-        assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], 0.5) and head.value is not None
+        assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], sigma_init) and head.value is not None
         # σ₀ over the square root of the inputs
-        assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(0.5 / n_features**0.5)
+        assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(sigma_init / n_features**0.5)
         assert (str(layer.group), layer.n_blocks, policy.state_dim) == ("SE(2)", 12, 72)
         assert policy.online.features_extractor.features_dim == n_features
         assert sum(p.numel() for p in layer.to_algebra.parameters()) == (3136 + 1) * 36
