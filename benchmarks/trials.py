@@ -88,7 +88,10 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     started = time.monotonic()
     model.learn(steps, log_interval=4 if game in WORLDS else 20)
     seconds = time.monotonic() - started
+    goals = {}
     if game in WORLDS:
+        returns = [value for one in env.env_method("get_episode_rewards") for value in one]
+        goals = {"return_in_all": round(float(np.sum(returns)), 3), "episodes": len(returns)}
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
@@ -104,6 +107,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         "seconds": round(seconds, 1),
         "curve": [round(value, 3) for value in curve],
         **skill,
+        **goals,
         "train": {key.removeprefix("train/"): float(f"{value:.4g}") for key, value in logged.items()},
     }
 
