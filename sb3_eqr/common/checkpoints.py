@@ -15,8 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_eqr.common.arguments import check, integer
-from sb3_eqr.common.env_state import capture, restore
+from sb3_eqr.common.arguments import ALGORITHM, check, integer
+from sb3_eqr.common.env_state import CLASS, capture, restore
 from sb3_eqr.common.files import atomic_folder, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
@@ -51,6 +51,7 @@ def write_checkpoint(
         manifest = {
             "algorithm": type(model).__name__,
             "num_timesteps": model.num_timesteps,
+            "settings": settings_of(model),
             "hidden": hidden,  # what of the environment cannot be restored
             "rng": encode(get_rng_state(model.action_space)),
             "notes": encode(notes),
@@ -60,6 +61,12 @@ def write_checkpoint(
     for old in find_checkpoints(folder)[:-keep]:
         shutil.rmtree(old, ignore_errors=True)
     return checkpoint
+
+
+def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
+    """The arguments of an agent that are plain values, by which its run is told from another one."""
+    found = {name: getattr(model, name, None) for name in ALGORITHM if name not in ("verbose", "tensorboard_log")}
+    return {name: value for name, value in found.items() if isinstance(value, (bool, int, float, str))}
 
 
 @contextmanager
@@ -126,7 +133,7 @@ def restore_environment(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bo
     while innermost.get("venv") is not None:
         innermost = innermost["venv"]
     if wrappers_only:
-        for name in set(innermost) - {KIND}:
+        for name in set(innermost) - {KIND, CLASS}:
             del innermost[name]
     restore(env, state)
 
@@ -147,14 +154,15 @@ def warn_of_hidden(checkpoint: pathlib.Path, manifest: dict[str, Any]) -> None:
 class ExactCheckpointCallback(BaseCallback):
     """
     Checkpoints from which ``resume`` continues bit for bit: model, replay buffer, VecNormalize, the environments' states and
-    the random generators, as one folder ``checkpoint-<step>`` that is complete or absent. They are written between two
-    rollouts, at the first such moment after every ``save_freq`` steps.
+    the random generators, as one folder ``checkpoint-<step>`` that is complete or absent. They are written before a rollout,
+    at the first such moment after every ``save_freq`` steps: none at the very end, and with ``train_freq=128`` at multiples
+    of 128.
 
     :param save_freq: steps of all environments between two checkpoints, ≥ 1
     :param save_path: folder for them
     :param keep: how many of the last ones stay, ≥ 1
     :param verbose: 1 prints where each is written
-    :raises ValueError: for an argument out of its range
+    :raises ValueError: for an argument out of its range; when ``learn`` begins, for a folder with checkpoints of another run
     """
 
     def __init__(self, save_freq: int, save_path: str | pathlib.Path, keep: int = 2, verbose: int = 0):
@@ -168,6 +176,26 @@ class ExactCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._last = self.num_timesteps // self.save_freq
+        if not hasattr(self.model, "resume"):
+            raise ValueError(
+                "ExactCheckpointCallback: expected an agent of this package, which can resume, found "
+                f"{type(self.model).__name__}. Use SB3's CheckpointCallback."
+            )
+        self._check_folder()
+
+    def _check_folder(self) -> None:
+        """Two runs in one folder would take each other's checkpoints for their own."""
+        old = find_checkpoints(self.save_path)
+        manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
+        theirs, ours = manifest.get("settings", {}), settings_of(self.model)
+        other = [name for name in theirs if theirs[name] != ours.get(name)]
+        is_behind = self.model.seed is None and manifest.get("num_timesteps", 0) > self.model.num_timesteps
+        if other or is_behind:
+            why = f"{other[0]} = {theirs[other[0]]!r} there, {ours.get(other[0])!r} here" if other else "this one has no seed"
+            raise ValueError(
+                f"{self.save_path} must be empty or hold checkpoints of this run, got those of another one ({why}). "
+                "Pass another folder, or continue that run with resume."
+            )
 
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps // self.save_freq > self._last:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.plain_data import KIND, decode, encode
 
@@ -20,6 +21,7 @@ from sb3_eqr.common.plain_data import KIND, decode, encode
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
 FIXED += (spaces.Space, np.dtype, io.IOBase, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
+CLASS = ":class:"  # the name of an object's class
 PLAIN = (bool, int, float, str, bytes, np.generic)
 
 
@@ -62,7 +64,9 @@ def _capture(value: Any, path: str, seen: set[int], hidden: list[str]) -> Any:
         hidden.append(path)
         return None
     children = {name: child for name, child in vars(value).items() if name not in SKIPPED}
-    return {KIND: "attributes", **{name: _capture(child, f"{path}.{name}", seen, hidden) for name, child in children.items()}}
+    kind = {CLASS: type(value).__name__} if isinstance(value, VecEnv) else {}  # packages replace wrappers of gymnasium
+    found = {name: _capture(child, f"{path}.{name}", seen, hidden) for name, child in children.items()}
+    return {KIND: "attributes", **kind, **found}
 
 
 def _restored(current: Any, state: Any, path: str) -> Any:
@@ -96,10 +100,14 @@ def _restored_emulator(current: Any, state: Any, path: str) -> Any:
 
 
 def _restored_attributes(current: Any, state: Any, path: str) -> Any:
-    if current is None:
-        raise ValueError(f"{path}: the environment must be built as the one whose state this is")
+    found, expected = type(current).__name__, state.get(CLASS, type(current).__name__)
+    if current is None or found != expected:
+        raise ValueError(
+            f"{path} must be a {expected}, got {'nothing' if current is None else found}: the environment is not built as in "
+            "the run that is resumed. Pass one with the same wrappers, VecNormalize included."
+        )
     for name, child in state.items():
-        if name != KIND:
+        if name not in (KIND, CLASS):
             setattr(current, name, _restored(getattr(current, name, None), child, f"{path}.{name}"))
     return current
 

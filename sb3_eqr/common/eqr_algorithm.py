@@ -251,6 +251,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        validation.check_env(env)
         with validation.environment_errors(0):
             wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         validation.check_action_space(wrapped.action_space)

@@ -23,9 +23,9 @@ class FiniteData(OffPolicyAlgorithm):
     _statistics: dict[str, Any] | None = None  # of the last step that was accepted
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self._warn_without_normalization()
         with environment_errors(self.num_timesteps):
             result = super()._setup_learn(*args, **kwargs)
-        self._warn_without_normalization()
         check_finite("observation", self._last_obs, self.num_timesteps)
         self._statistics = statistics_of(self._vec_normalize_env)
         return result
@@ -37,9 +37,14 @@ class FiniteData(OffPolicyAlgorithm):
 
     def _warn_without_normalization(self) -> None:
         """Once trained behind VecNormalize, an agent that sees raw observations acts at random."""
-        if self.trained_normalized and self._vec_normalize_env is None:
+        counts = (
+            [part.count for part in _parts(self._vec_normalize_env, "obs_rms").values()] if self._vec_normalize_env else []
+        )
+        is_new = bool(counts) and max(counts) < 1  # it has seen nothing yet
+        if self.trained_normalized and (self._vec_normalize_env is None or is_new):
+            found = "that VecNormalize is new" if is_new else "its environment is not"
             warnings.warn(
-                "This agent was trained behind VecNormalize, and its environment is not: it sees other numbers than it knows. "
+                f"This agent was trained behind VecNormalize, and {found}: it sees other numbers than it knows. "
                 "Pass VecNormalize.load(path, venv) as env, with the statistics that were saved beside the model."
             )
         self.trained_normalized = self._vec_normalize_env is not None

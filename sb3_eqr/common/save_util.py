@@ -7,6 +7,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -19,7 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_eqr.common.checkpoints import BUFFER, MODEL, read_manifest, restore_environment, restore_generators, warn_of_hidden
 from sb3_eqr.common.files import atomic_write
-from sb3_eqr.common.plain_data import UntrustedError, decode, encode
+from sb3_eqr.common.plain_data import UntrustedError, decode, encode, names_in
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.replay.buffer_files import read_buffer, write_buffer
 from sb3_eqr.common.validation import check_names
@@ -30,13 +31,13 @@ SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 def is_whole_model(path: pathlib.Path) -> bool:
     """
     :param path: an existing file
-    :return: whether it is a zip file with everything that SB3's ``save`` puts in. The parts of a model are zip files
-        themselves, so one that was cut off may still look like a zip file.
+    :return: whether it is a zip file with everything that SB3's ``save`` puts in, unchanged. The parts of a model are zip
+        files themselves, so one that was cut off may still look like a zip file.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            return {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
-    except zipfile.BadZipFile:
+            return {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist()) and archive.testzip() is None
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # of damaged headers
         return False
 
 
@@ -150,16 +151,27 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: for a keyword that is no argument of the agent
         """
-        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.__init__).parameters][3:])
+        check_names(
+            f"{cls.__name__}.load",
+            kwargs,
+            [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:],
+        )
         if isinstance(path, (str, pathlib.Path)):
             found = find_file(path)
             if found is not None and not is_whole_model(found):
                 raise ValueError(
-                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off or something else. "
-                    "Load an earlier checkpoint."
+                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off, damaged or "
+                    "something else. Load an earlier checkpoint."
                 )
         given = custom_objects or {}
         data = {name: value for name, value in read_data(path).items() if name not in given}
+        saved = data.get("policy_class") or {}
+        module = str(saved.get("module", saved.get("__module__", ""))) if isinstance(saved, dict) else ""
+        if module.startswith(("stable_baselines3.", "sb3_contrib.")):
+            raise ValueError(
+                f"{path}: expected a file of {cls.__name__}.save, found an agent whose policy is of {module}. "
+                "Load it by the class that saved it."
+            )
         objects = {**decode_data(path, data, trust), **given}  # in place of SB3's unpickling
         model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
@@ -185,6 +197,8 @@ class SafeFiles(OffPolicyAlgorithm):
         :param trust: likewise
         :raises ValueError: if there is no complete checkpoint, or a file in it has changed
         """
+        if env is None:
+            raise ValueError("env must be an environment, built as for the run that is resumed, got None.")
         checkpoint, manifest = read_manifest(pathlib.Path(path))
         is_exact = not manifest["hidden"]
         if not is_exact:
@@ -243,7 +257,11 @@ class SafeFiles(OffPolicyAlgorithm):
             if is_ours:
                 return read_buffer(file, before)  # type: ignore[arg-type]
             if not trust:
-                raise ValueError("it is truncated, or a pickle, whose loading runs code: pass trust=True for one of yours")
+                named = ", ".join(names_in(file.read()))
+                raise ValueError(
+                    "it is truncated, or a pickle, whose loading runs the code that it names"
+                    f"{f' ({named})' if named else ''}: pass trust=True for one of yours"
+                )
             super().load_replay_buffer(file)  # type: ignore[arg-type]
             return self.replay_buffer, {}
         except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:

@@ -10,12 +10,13 @@ from difflib import get_close_matches
 from functools import wraps
 from typing import Any, ParamSpec
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr.common.arguments import check, integer, number
+from sb3_eqr.common.arguments import POLICY, check, integer, number
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
@@ -98,6 +99,7 @@ def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewh
     for name in given:
         if name not in legal:
             places = [place for place, taker in elsewhere.items() if name in inspect.signature(taker).parameters]
+            places += ["policy_kwargs"] if "policy_kwargs" in elsewhere and name in POLICY else []  # of one of the agents
             near = ["symmetry_coef"] if name == "get_coef" else get_close_matches(name, legal, n=1)
             advice = f"It takes {', '.join(one for one in legal if not one.startswith('_'))}."
             advice = f"Pass {places[0]}=dict({name}=...)." if places else f"Did you mean {near[0]!r}?" if near else advice
@@ -121,6 +123,14 @@ def answers_misspelt(**elsewhere: type) -> Callable[[Callable[P, None]], Callabl
         return checked
 
     return decorator
+
+
+def check_env(env: Any) -> None:
+    """Refuse what is no environment, such as its class."""
+    if not isinstance(env, (gym.Env, VecEnv)):
+        raise ValueError(
+            f"env must be an environment or a VecEnv, got {env!r}. make_vec_env(...) makes one of a name or a class."
+        )
 
 
 def check_action_space(action_space: spaces.Space) -> None:

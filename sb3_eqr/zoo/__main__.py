@@ -37,12 +37,13 @@ DOWNLOADS = "rl-trained-agents"  # where enjoy looks, and puts what it downloads
 # What the extra brings.
 EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
+RESUMING = """train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's
+folder, and --resume FOLDER, which continues a run from its last one; --trust where its settings hold Python objects
+"""
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
 
 Every command but the last two takes RL Zoo's arguments: sb3-eqr train --help
-train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's folder, and
---resume FOLDER, which continues a run from its last one; --trust where its settings hold Python objects
-benchmark compares agents over games and seeds: sb3-eqr benchmark --help
+{RESUMING}benchmark compares agents over games and seeds: sb3-eqr benchmark --help
 visualize shows what a saved agent has learned: sb3-eqr visualize --help
 push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
 
@@ -81,6 +82,8 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--load-best", action="store_true")
     parser.add_argument("--load-checkpoint")
     parser.add_argument("--load-last-checkpoint", action="store_true")
+    parser.add_argument("--seed", type=int, default=-1)
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
     add_resuming(parser)
     try:
         return parser.parse_known_args(arguments)[0]
@@ -111,7 +114,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
         check_entry(args.hyperparams, algo, "--hyperparams")
         return None
     entry = read_entry(path, args.env, args.hyperparams)
-    check_entry(entry, algo, path)
+    check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
     return path
 
@@ -132,7 +135,13 @@ def prepare_resuming(args: argparse.Namespace) -> None:
         fail(f"--checkpoint-every and --resume: expected --algo {' or '.join(AGENTS)}, found {args.algo}.")
     if args.checkpoint_every is not None and args.checkpoint_every < 1:
         fail(f"--checkpoint-every: expected at least 1 step, found {args.checkpoint_every}.")
+    if args.optimize_hyperparameters and is_asked:
+        fail("--checkpoint-every and --resume: expected one run, found a search (-optimize).")
     if args.resume is not None:
+        if args.hyperparams or args.trained_agent or args.seed != -1:
+            fail(
+                "--resume continues a run with its own settings and seed: leave out --hyperparams, --trained-agent and --seed."
+            )
         try:
             read_manifest(resuming.checkpoints_of(args.resume))
         except ValueError as error:
@@ -253,6 +262,8 @@ def main() -> None:
         arguments = [argument for argument in arguments if argument != "--dry-run"]
     if not {"-h", "--help"} & set(arguments):
         arguments = prepare(command, arguments)
+    elif command == "train":
+        print(RESUMING)
     run(command, arguments)
 
 

@@ -10,7 +10,7 @@ import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS
 
-from sb3_eqr.common.arguments import DICTIONARY, FLAG, NONE, TEXT, integer, number
+from sb3_eqr.common.arguments import DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
@@ -27,12 +27,23 @@ FLAGS = {
     "tensorboard_log": "--tensorboard-log",
     "_init_setup_model": "nothing",
 }
+
+
+def is_schedule(value: Any) -> bool:
+    """Whether RL Zoo makes a schedule of it: "lin_1e-3" falls to 0."""
+    try:
+        return isinstance(value, str) and value.startswith("lin_") and float(value.removeprefix("lin_")) >= 0
+    except ValueError:
+        return False
+
+
 # What it reads itself.
 RULES = {
     "n_timesteps": number(0, above=True),
     "n_envs": integer(1),
     "frame_stack": integer(1) | NONE,
     "normalize": FLAG | TEXT | DICTIONARY,
+    "learning_rate": number(0) | Rule("lin_ and a number (YAML reads 1e-3 as text: write 1.0e-3)", is_schedule),
 }
 
 
@@ -72,7 +83,7 @@ def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
     is_atari = exp_manager.ExperimentManager.is_atari(env_id)
     name = env_id if env_id in entries else "atari" if is_atari else "default"
     if name not in entries:
-        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries)}. Add one, or use another file.")
+        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries) or 'none'}. Add one, or use another file.")
     if not isinstance(entries[name] or {}, dict):
         fail(f"{path}: {name}: expected hyperparameters by name, found {entries[name]!r:.60}.")
     entry = {**(entries[name] or {}), **changes}

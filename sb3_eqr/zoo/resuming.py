@@ -46,6 +46,8 @@ class ResumableExperiment(ExperimentManager):
         if self.resume is None:
             return super()._load_pretrained_agent(hyperparams, env)
         model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
+        if self.n_timesteps <= model.num_timesteps:
+            fail(f"--resume: {self.resume} is at step {model.num_timesteps} already, of {self.n_timesteps}. Pass a larger -n.")
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         return model
@@ -54,7 +56,7 @@ class ResumableExperiment(ExperimentManager):
         """RL Zoo's, which counts steps from 0; a resumed run counts on."""
         if self.resume is None:
             super().learn(model)
-        elif self.n_timesteps > 0:
+        else:
             counting_on = partial(model.learn, reset_num_timesteps=False)
             super().learn(SimpleNamespace(learn=counting_on, env=model.env))  # type: ignore[arg-type]
 

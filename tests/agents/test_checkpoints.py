@@ -5,6 +5,7 @@ import sys
 
 import pytest
 import torch as th
+from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
@@ -113,3 +114,37 @@ def test_a_state_that_cannot_be_seen_is_warned_of(tmp_path):
 def test_callback_arguments(wrong, tmp_path):
     with pytest.raises(ValueError, match=r"must be an integer >= 1, got"):
         ExactCheckpointCallback(**{"save_freq": 10, "save_path": tmp_path, **wrong})
+
+
+def test_runs_do_not_share_a_folder(checkpoint):
+    folder = checkpoint.parent
+    before = sorted(folder.iterdir())
+    for changes, why in (({"gamma": 0.5}, "gamma = 0.99 there, 0.5 here"), ({"seed": None}, r"seed = 3 there, None here")):
+        other = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, **changes})
+        with pytest.raises(ValueError, match=rf"must be empty or hold checkpoints of this run, .*{why}.*Pass another folder"):
+            other.learn(60, ExactCheckpointCallback(20, folder))
+    assert sorted(folder.iterdir()) == before
+    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(30, ExactCheckpointCallback(20, folder))  # the same run once more
+
+
+def test_a_run_without_a_seed_does_not_begin_again_in_its_folder(tmp_path):
+    for is_first in (True, False):
+        model = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, "seed": None})
+        if is_first:
+            model.learn(60, ExactCheckpointCallback(20, tmp_path))
+        else:
+            with pytest.raises(ValueError, match="this one has no seed"):
+                model.learn(60, ExactCheckpointCallback(20, tmp_path))
+
+
+def test_the_environment_must_be_built_alike(checkpoint):
+    with pytest.raises(ValueError, match=r"must be a DummyVecEnv, got VecNormalize: .*VecNormalize included"):
+        EqRQRDQN.resume(checkpoint, VecNormalize(make_vec_env(ChainEnv)))
+    with pytest.raises(ValueError, match="env must be an environment, built as for the run"):
+        EqRQRDQN.resume(checkpoint, None)
+
+
+def test_stock_agents_cannot_resume(tmp_path):
+    model = DQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
+    with pytest.raises(ValueError, match=r"expected an agent of this package.*found DQN. Use SB3's CheckpointCallback"):
+        model.learn(5, ExactCheckpointCallback(2, tmp_path))

@@ -381,3 +381,24 @@ def test_devices(make):
 def test_every_wrong_argument_is_answered_by_name():
     found = wrong_arguments()
     assert found.holds, found.details
+
+
+def test_a_new_vec_normalize_is_warned_of(make, tmp_path):
+    model = make(VecNormalize(make_vec_env(ChainEnv)))
+    model.learn(60)
+    model.save(tmp_path / "model")
+    new = type(model).load(tmp_path / "model", VecNormalize(make_vec_env(ChainEnv)), force_reset=False)
+    with pytest.warns(UserWarning, match="trained behind VecNormalize, and that VecNormalize is new"):
+        new.learn(5)
+
+
+@pytest.mark.parametrize("env", [ChainEnv, 3])
+def test_what_is_no_environment(make, env):
+    with pytest.raises(ValueError, match=r"env must be an environment or a VecEnv, got .*make_vec_env"):
+        make(env)
+
+
+def test_arguments_of_the_policy_are_sent_there():
+    for kind, name in ((EqRRainbow, "v_min"), (EqRQRDQN, "n_quantiles"), (EqRRainbow, "layer_norm")):
+        with pytest.raises(TypeError, match=rf"unexpected argument '{name}'. Pass policy_kwargs=dict\({name}=...\)"):
+            kind("MlpPolicy", ChainEnv(), **{name: 1})

@@ -58,6 +58,11 @@ def sb3_eqr(monkeypatch, capfd):
         ("enjoy --algo eqr_qrdqn", "was not found.* train one first"),
         ("train --algo eqr_qrdqn -i nothing.zip", "expected the path of a .zip file.*'nothing.zip'"),
         ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
+        (
+            "train --algo eqr_qrdqn -params learning_rate:'1e-3'",
+            "learning_rate must be .* lin_ and a number .*write 1.0e-3.*got '1e-3'",
+        ),
+        ("train --algo eqr_qrdqn -optimize --checkpoint-every 9", "expected one run, found a search"),
         ("train --algo ppo --resume nowhere", "expected --algo eqr_qrdqn or eqr_rainbow, found ppo"),
         ("train --algo eqr_qrdqn --resume nowhere", "nowhere must be a checkpoint .*, got nothing"),
         ("train --algo eqr_qrdqn --checkpoint-every 0", "expected at least 1 step, found 0"),
@@ -173,13 +178,20 @@ def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
     assert (tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip").exists()
 
 
-def test_a_stopped_run_is_resumed_exactly(sb3_eqr, tmp_path):
-    line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 1300 --eval-freq -1 -f {tmp_path} -params learning_starts:100"
-    sb3_eqr(f"{line} --seed 1 --checkpoint-every 500")
+def test_a_stopped_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
+    line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 1300 --eval-freq -1 -f {tmp_path}"
+    sb3_eqr(f"{line} --seed 1 --checkpoint-every 500 -params learning_starts:100")
     whole = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
-    shown = sb3_eqr(f"{line} --seed 2 --resume {whole}/checkpoints/checkpoint-000000000512")
+    for more, message in (
+        ("--seed 2", "leave out --hyperparams, --trained-agent and --seed"),
+        ("-n 500", "at step 1024 already"),
+    ):
+        with pytest.raises(SystemExit):
+            sb3_eqr(f"{line} {more} --resume {whole}")
+        assert message in capfd.readouterr().err
+    shown = sb3_eqr(f"{line} --resume {whole}/checkpoints/checkpoint-000000000512")
     assert "Resuming at step 512" in shown
-    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_2"
+    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_3"  # the second one had too few steps to go
     first, second = (EqRQRDQN.load(folder / "CartPole-v1.zip") for folder in (whole, resumed))
     assert first.num_timesteps == second.num_timesteps == 1408  # a round of 128 steps
     for name, parameter in first.policy.state_dict().items():

@@ -34,6 +34,8 @@ def read_buffer(file: BinaryIO, like: Any) -> tuple[Any, dict[str, Any]]:
     """
     try:
         with np.load(file, allow_pickle=False) as members:  # the zip format checks a sum of each member
+            if not isinstance(members[DATA], np.ndarray):
+                raise ValueError("it is a model or another zip file, no replay buffer")
             data = json.loads(members[DATA].tobytes())
             state = _unpacked(data["state"], members)
     except (zipfile.BadZipFile, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
