@@ -100,11 +100,11 @@ def _restored_emulator(current: Any, state: Any, path: str) -> Any:
 
 
 def _restored_attributes(current: Any, state: Any, path: str) -> Any:
-    found, expected = type(current).__name__, state.get(CLASS, type(current).__name__)
-    if current is None or found != expected:
+    found, expected = type(current).__name__, state.get(CLASS)
+    if current is None or (expected is not None and found != expected):
         raise ValueError(
-            f"{path} must be a {expected}, got {'nothing' if current is None else found}: the environment is not built as in "
-            "the run that is resumed. Pass one with the same wrappers, VecNormalize included."
+            f"{path} must be {'an object' if expected is None else f'a {expected}'}, got {'nothing' if current is None else found}: "
+            "the environment is not built as in the run that is resumed. Pass one with the same wrappers, VecNormalize included."
         )
     for name, child in state.items():
         if name not in (KIND, CLASS):

@@ -82,5 +82,5 @@ def test_another_environment_is_refused():
     first.reset()
     second.reset()
     state, _ = capture(second)
-    with pytest.raises(ValueError, match="must be built as the one whose state this is"):
+    with pytest.raises(ValueError, match="must be an object, got nothing: the environment is not built as"):
         restore(first, state)
