@@ -103,8 +103,9 @@ def _restored_attributes(current: Any, state: Any, path: str) -> Any:
     found, expected = type(current).__name__, state.get(CLASS)
     if current is None or (expected is not None and found != expected):
         raise ValueError(
-            f"{path} must be {'an object' if expected is None else f'a {expected}'}, got {'nothing' if current is None else found}: "
-            "the environment is not built as in the run that is resumed. Pass one with the same wrappers, VecNormalize included."
+            f"{path} must be {'an object' if expected is None else f'a {expected}'}, "
+            f"got {'nothing' if current is None else found}: the environment is not built as in the run that is resumed. "
+            "Pass one with the same wrappers, VecNormalize included."
         )
     for name, child in state.items():
         if name not in (KIND, CLASS):
