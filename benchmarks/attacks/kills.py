@@ -20,7 +20,7 @@ from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
 
-STEPS, SAVE_FREQ = 3_000, 60  # several checkpoints a second
+STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints a second
 LONGEST = 1.5  # seconds that a run lives before it is killed
 FORK = multiprocessing.get_context("fork")  # nothing has to be imported again
 
@@ -40,25 +40,29 @@ def train(folder: pathlib.Path) -> None:
     model.save(folder / "final.zip")
 
 
-def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> list[Any]:
+def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> tuple[list[Any], int]:
     """
-    Start a run as often as it takes: the first ones are killed, the others may end.
+    Start a run as often as it takes: it is killed until so many kills have met a living process, then it may end.
 
-    :return: exit codes that are neither 0 nor that of the kill
+    :return: exit codes that are neither 0 nor that of the kill, and how many kills there were
     """
-    strange = []
-    for count in range(0, kills + 1, at_once):
+    strange: list[Any] = []
+    done = 0
+    while True:
         processes = [FORK.Process(target=start) for _ in range(at_once)]
         for process in processes:
             process.start()
+        is_last = done >= kills
         for process in processes:
-            if count < kills:
+            if not is_last:
                 process.join(rng.uniform(0, LONGEST / at_once))
                 if process.pid is not None and process.is_alive():
                     os.kill(process.pid, signal.SIGKILL)
             process.join()
+            done += process.exitcode == -signal.SIGKILL
             strange += [process.exitcode] if process.exitcode not in (0, -signal.SIGKILL) else []
-    return strange
+        if is_last or all(process.exitcode == 0 for process in processes):
+            return strange, done
 
 
 def left_over(folder: pathlib.Path) -> list[str]:
@@ -78,10 +82,10 @@ def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: i
     if not (undisturbed / "final.zip").is_file():
         kill_until_done(lambda: train(undisturbed), 0, rng)
     killed.mkdir(parents=True)
-    strange = kill_until_done(lambda: train(killed), kills, rng, at_once)
+    strange, done = kill_until_done(lambda: train(killed), kills, rng, at_once)
     is_there = (killed / "final.zip").is_file()
     is_same, partial = is_there and same_parameters(undisturbed, killed), left_over(killed)
-    name = f"{kills} SIGKILLs of a run" if at_once == 1 else f"{kills} SIGKILLs of {at_once} runs on one folder"
+    name = f"{done} SIGKILLs of a run" if at_once == 1 else f"{done} SIGKILLs of {at_once} runs on one folder"
     found = (
         f"{'equal bits' if is_same else 'other bits' if is_there else 'lost'}, {len(partial)} partial, {len(strange)} errors"
     )
@@ -94,15 +98,16 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
     suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
     agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
     scores: dict[str, list[Any]] = {}
-    strange, partial = [], []
+    strange, partial, done = [], [], 0
     for name, count in (("undisturbed", 0), ("killed", kills // len(agents) + 1)):
         for run in plan_runs(folder / name, suite, agents, 1):
-            strange += kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
+            found, hits = kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
+            strange, done = strange + found, done + hits
             result = json.loads((run.folder / RESULT).read_text()) if (run.folder / RESULT).is_file() else {}
             scores.setdefault(name, []).append((result.get("evaluations"), result.get("training")))
         partial += left_over(folder / name)
     is_same = scores["undisturbed"] == scores["killed"] and None not in scores["killed"][0]
     found = f"{'equal' if is_same else 'other'} scores, {len(partial)} partial, {len(strange)} errors"
     holds = is_same and not partial and not strange
-    name = f"{kills} SIGKILLs of the benchmark (smoke)"
+    name = f"{done} SIGKILLs of the benchmark (smoke)"
     return Finding(name, "equal scores, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
