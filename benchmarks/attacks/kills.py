@@ -98,11 +98,13 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
     suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
     agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
     scores: dict[str, list[Any]] = {}
-    strange, partial, done = [], [], 0
+    strange: list[Any] = []
+    partial: list[str] = []
+    done = 0
     for name, count in (("undisturbed", 0), ("killed", kills // len(agents) + 1)):
         for run in plan_runs(folder / name, suite, agents, 1):
-            found, hits = kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
-            strange, done = strange + found, done + hits
+            codes, hits = kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
+            strange, done = strange + codes, done + hits
             result = json.loads((run.folder / RESULT).read_text()) if (run.folder / RESULT).is_file() else {}
             scores.setdefault(name, []).append((result.get("evaluations"), result.get("training")))
         partial += left_over(folder / name)
