@@ -9,6 +9,7 @@ import importlib
 import io
 import pickle
 import pickletools
+import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from types import FunctionType
@@ -24,6 +25,8 @@ from torch import nn
 
 KIND = ":kind:"  # marks what JSON has no form for
 PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_eqr")  # whose classes are found by name
+# Modules of these only define; of other packages a file gets what is imported already: some of torch's modules run as programs.
+DEFINING = ("stable_baselines3.", "sb3_contrib.")
 CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # and are derived from one of these
 # Classes whose objects are their attributes and nothing else.
 OBJECTS = {
@@ -203,7 +206,10 @@ DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
 def _find(module: str, name: str) -> Any:
     if module.split(".")[0] not in PACKAGES and module not in OBJECTS:
         raise ValueError(f"data must name classes of {', '.join(PACKAGES)}, got {module}.{name}")
-    found: Any = importlib.import_module(module)
+    may_import = module in OBJECTS or module.startswith(DEFINING)
+    found: Any = importlib.import_module(module) if may_import else sys.modules.get(module)
+    if found is None:
+        raise ValueError(f"data must name a class that agents are made of, got {module}.{name}")
     for part in name.split("."):
         found = getattr(found, part)
     return found

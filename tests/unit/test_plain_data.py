@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import sys
 from collections import deque
 from functools import partial
 
@@ -93,6 +94,15 @@ FORGED = [
 def test_forged_data_is_refused(forged):
     with pytest.raises(ValueError):
         decode(forged)
+
+
+def test_a_file_cannot_choose_what_is_imported():
+    program = "torch.utils.model_dump.__main__"
+    with pytest.raises(ValueError, match=r"must name a class that agents are made of, got torch\.utils\.model_dump"):
+        decode({KIND: "class", "module": program, "name": "Module"})
+    assert program not in sys.modules
+    optimizer = {"module": "stable_baselines3.common.sb2_compat.rmsprop_tf_like", "name": "RMSpropTFLike"}
+    assert issubclass(decode({KIND: "class", **optimizer}), th.optim.Optimizer)
 
 
 def test_a_pickle_is_named_and_not_run():
