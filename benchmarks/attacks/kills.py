@@ -15,13 +15,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.attacks import Finding
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.plan import plan_runs
-from sb3_eqr.benchmark.run import RESULT, Settings
+from sb3_eqr.benchmark.run import RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
 
 STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints a second
 LONGEST = 1.5  # seconds that a run lives before it is killed
+KILLS_OF_ONE = 30  # short runs end before that
 FORK = multiprocessing.get_context("fork")  # nothing has to be imported again
 
 
@@ -94,22 +95,31 @@ def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: i
 
 
 def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Finding:
-    """The runs of the suite smoke as Ray's workers do them, killed, beside undisturbed ones."""
+    """The runs of the suite smoke as Ray's workers do them, seed after seed, killed, beside undisturbed ones."""
     suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
     agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
-    scores: dict[str, list[Any]] = {}
+    different: list[Any] = []
     strange: list[Any] = []
-    partial: list[str] = []
-    done = 0
-    for name, count in (("undisturbed", 0), ("killed", kills // len(agents) + 1)):
-        for run in plan_runs(folder / name, suite, agents, 1):
-            codes, hits = kill_until_done(lambda run=run: execute(run, settings), count, rng)  # type: ignore[misc]
-            strange, done = strange + codes, done + hits
-            result = json.loads((run.folder / RESULT).read_text()) if (run.folder / RESULT).is_file() else {}
-            scores.setdefault(name, []).append((result.get("evaluations"), result.get("training")))
-        partial += left_over(folder / name)
-    is_same = scores["undisturbed"] == scores["killed"] and None not in scores["killed"][0]
-    found = f"{'equal' if is_same else 'other'} scores, {len(partial)} partial, {len(strange)} errors"
-    holds = is_same and not partial and not strange
-    name = f"{done} SIGKILLs of the benchmark (smoke)"
-    return Finding(name, "equal scores, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
+    done, seeds = 0, 0
+    while done < kills:
+        seeds += 1
+        plans = [plan_runs(folder / name, suite, agents, seeds) for name in ("undisturbed", "killed")]
+        for undisturbed, killed in zip(*plans, strict=True):
+            if undisturbed.seed == seeds - 1:
+                kill_until_done(lambda run=undisturbed: execute(run, settings), 0, rng)  # type: ignore[misc]
+                codes, hits = kill_until_done(lambda run=killed: execute(run, settings), KILLS_OF_ONE, rng)  # type: ignore[misc]
+                strange, done = strange + codes, done + hits
+                expected, found = scores(undisturbed), scores(killed)
+                different += [str(killed.folder)] if found is None or found != expected else []
+    partial = left_over(folder)
+    found = f"{'other' if different else 'equal'} scores, {len(partial)} partial, {len(strange)} errors"
+    wrong = tuple(map(str, [*different, *partial, *strange]))
+    name = f"{done} SIGKILLs of {seeds * len(agents)} runs of the benchmark (smoke)"
+    return Finding(name, "equal scores, 0 partial files, 0 errors", found, not wrong, wrong)
+
+
+def scores(run: Run) -> Any:
+    """What a finished run has measured."""
+    path = run.folder / RESULT
+    result = json.loads(path.read_text()) if path.is_file() else None
+    return None if result is None else (result["evaluations"], result["training"])

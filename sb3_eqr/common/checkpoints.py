@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.arguments import ALGORITHM, check, integer
 from sb3_eqr.common.env_state import CLASS, capture, restore
-from sb3_eqr.common.files import atomic_folder, remove_leftovers
+from sb3_eqr.common.files import atomic_folder, checksum, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 
@@ -55,7 +55,7 @@ def write_checkpoint(
             "hidden": hidden,  # what of the environment cannot be restored
             "rng": encode(get_rng_state(model.action_space)),
             "notes": encode(notes),
-            "sha256": {path.name: checksum(path) for path in sorted(partial.iterdir())},
+            "sha256": {path.name: checksum_of(path) for path in sorted(partial.iterdir())},
         }
         (partial / MANIFEST).write_text(json.dumps({**manifest, "digest": digest(manifest)}), encoding="utf-8")
     for old in find_checkpoints(folder)[:-keep]:
@@ -80,13 +80,10 @@ def _last_named(folder: pathlib.Path) -> Iterator[None]:
         raise OSError(errno.ENOSPC, f"{error.strerror}. The last checkpoint, {left[-1].name}, is whole") from error
 
 
-def checksum(path: pathlib.Path) -> str:
+def checksum_of(path: pathlib.Path) -> str:
     """SHA-256 of a file, as hexadecimal digits."""
-    found = hashlib.sha256()
     with open(path, "rb") as file:
-        while piece := file.read(1 << 20):
-            found.update(piece)
-    return found.hexdigest()
+        return checksum(file, path.stat().st_size)
 
 
 def digest(manifest: dict[str, Any]) -> str:
@@ -114,7 +111,7 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     try:
         manifest = json.loads((found / MANIFEST).read_text(encoding="utf-8"))
         changed = [MANIFEST] if manifest.pop("digest") != digest(manifest) else []
-        changed += [name for name, expected in manifest["sha256"].items() if checksum(found / name) != expected]
+        changed += [name for name, expected in manifest["sha256"].items() if checksum_of(found / name) != expected]
     except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError) as error:
         raise ValueError(f"{found} must be a complete checkpoint, got {error!r}. Use an earlier one.") from error
     if changed:

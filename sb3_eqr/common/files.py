@@ -3,10 +3,13 @@
 import contextlib
 import errno
 import glob
+import hashlib
 import os
 import pathlib
 import shutil
+import struct
 import uuid
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -15,6 +18,9 @@ try:
     import fcntl
 except ImportError:  # Windows: leftovers of killed processes stay there
     fcntl = None  # type: ignore[assignment]
+
+
+SEAL = b"sha256:"  # and the digits: the comment of a sealed zip file
 
 
 @contextmanager
@@ -31,12 +37,43 @@ def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
         path = path.with_suffix(f".{suffix}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with _partial(path, is_folder=False) as partial:
-        with open(partial, "wb") as file:
+        with open(partial, "w+b") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
         _sync(path.parent)
+
+
+def checksum(file: BinaryIO, size: int) -> str:
+    """SHA-256 of the first ``size`` bytes of an open file, as hexadecimal digits."""
+    found = hashlib.sha256()
+    file.seek(0)
+    while size > 0 and (piece := file.read(min(size, 1 << 20))):
+        found.update(piece)
+        size -= len(piece)
+    return found.hexdigest()
+
+
+def seal(file: BinaryIO) -> None:
+    """
+    Give a zip file without a comment the checksum of all its bytes as one. The checksums of the format leave out its headers.
+
+    :param file: open for reading and writing
+    """
+    end = file.seek(-2, os.SEEK_END) + 2  # the length of the comment stands there
+    file.write(struct.pack("<H", len(SEAL) + 64))
+    file.write(SEAL + checksum(file, end).encode())
+
+
+def is_unbroken(file: BinaryIO) -> bool:
+    """Whether a zip file, open for reading, is as it was sealed; one without a comment never was."""
+    try:
+        comment = zipfile.ZipFile(file).comment
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # of damaged headers
+        return False
+    end = file.seek(0, os.SEEK_END) - len(comment)
+    return comment in (b"", SEAL + checksum(file, end).encode())
 
 
 @contextmanager

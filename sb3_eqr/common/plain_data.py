@@ -25,7 +25,7 @@ from torch import nn
 
 KIND = ":kind:"  # marks what JSON has no form for
 PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_eqr")  # whose classes are found by name
-# Modules of these only define; of other packages a file gets what is imported already: some of torch's modules run as programs.
+# Modules of these only define; of other packages a file gets what is imported already: some of torch's modules are programs.
 DEFINING = ("stable_baselines3.", "sb3_contrib.")
 CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # and are derived from one of these
 # Classes whose objects are their attributes and nothing else.

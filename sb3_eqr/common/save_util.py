@@ -19,7 +19,7 @@ from stable_baselines3.common.save_util import open_path, recursive_getattr, sav
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_eqr.common.checkpoints import BUFFER, MODEL, read_manifest, restore_environment, restore_generators, warn_of_hidden
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.files import atomic_write, is_unbroken, seal
 from sb3_eqr.common.plain_data import UntrustedError, decode, encode, names_in
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.replay.buffer_files import read_buffer, write_buffer
@@ -35,8 +35,9 @@ def is_whole_model(path: pathlib.Path) -> bool:
         files themselves, so one that was cut off may still look like a zip file.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist()) and archive.testzip() is None
+        with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+            is_model = {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
+            return is_model and is_unbroken(file) and archive.testzip() is None
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # of damaged headers
         return False
 
@@ -122,6 +123,7 @@ class SafeFiles(OffPolicyAlgorithm):
             return
         with atomic_write(path, "zip") as file:
             save_to_zip_file(file, data, self.get_parameters(), variables)  # type: ignore[arg-type]
+            seal(file)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # made by _setup_model
@@ -220,6 +222,7 @@ class SafeFiles(OffPolicyAlgorithm):
             return
         with atomic_write(path, "pkl") as file:  # SB3's ending, which scripts expect
             write_buffer(file, self.replay_buffer, notes)
+            seal(file)
 
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, trust: bool = False
@@ -253,6 +256,8 @@ class SafeFiles(OffPolicyAlgorithm):
         file = open_path(path, "r", verbose=self.verbose, suffix="pkl")
         try:
             is_ours = zipfile.is_zipfile(file)
+            if is_ours and not is_unbroken(file):  # type: ignore[arg-type]
+                raise ValueError("it has changed since it was saved")
             file.seek(0)
             if is_ours:
                 return read_buffer(file, before)  # type: ignore[arg-type]

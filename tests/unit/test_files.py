@@ -1,14 +1,17 @@
 """Files and folders are complete or absent, whoever writes."""
 
+import io
 import multiprocessing
 import os
 import signal
+import subprocess
 import threading
 import time
+import zipfile
 
 import pytest
 
-from sb3_eqr.common.files import atomic_folder, atomic_write
+from sb3_eqr.common.files import atomic_folder, atomic_write, is_unbroken, seal
 
 
 def names(folder):
@@ -23,6 +26,29 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         file.write(b"half")
         raise RuntimeError
     assert names(path.parent) == ["model.zip"] and (path.parent / "model.zip").read_bytes() == b"old"
+
+
+def test_every_flipped_bit_of_a_sealed_zip_file_is_found(tmp_path):
+    path = tmp_path / "some.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("name", "content")
+    with open(path, "rb") as file:
+        assert is_unbroken(file)  # without a seal
+    with open(path, "r+b") as file:
+        seal(file)
+        assert is_unbroken(file)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        assert archive.testzip() is None and archive.read("name") == b"content"
+    unsealed = whole[: -len("sha256:") - 64]
+    path.write_bytes(unsealed)
+    expected = subprocess.run(["sha256sum", path], capture_output=True, text=True, check=True).stdout.split()[0]
+    assert whole.removeprefix(unsealed) == b"sha256:" + expected.encode()
+    for place in range(len(whole)):
+        for bit in range(8):
+            changed = bytearray(whole)
+            changed[place] ^= 1 << bit
+            assert not is_unbroken(io.BytesIO(changed)), (place, bit)
 
 
 def hang(path):
