@@ -57,8 +57,12 @@ def _profiles(analysis: Analysis, style: dict[str, figures.Look]) -> Picture:
     taus = thresholds(analysis)
     named = {label(analysis.comparison, agent): matrix for agent, matrix in analysis.matrices.items()}
     profiles = {
-        "Score distributions": statistics.performance_profiles(named, taus, analysis.reps),
-        "Average score distributions": statistics.average_score_profiles(named, taus, analysis.reps),
+        "Score distributions": {
+            agent: statistics.performance_profile(matrix, taus, analysis.reps) for agent, matrix in named.items()
+        },
+        "Average score distributions": {
+            agent: statistics.average_score_profile(matrix, taus, analysis.reps) for agent, matrix in named.items()
+        },
     }
     caption = (
         "Fraction of runs (a) and of games, by their mean over runs (b), above a score, as Figure 4 of the EqR paper. "
@@ -127,7 +131,7 @@ def _along_training(analysis: Analysis, style: dict[str, figures.Look]) -> list[
         named = {label(comparison, agent): curve for agent, curve in curves.items()}
         steps = {result["protocol"]["steps"] for result in comparison.results}
         axis = ("training steps (thousands)", steps.pop() / 1_000) if len(steps) == 1 else ("fraction of training steps", 1.0)
-        efficiency = statistics.sample_efficiency(named, analysis.reps)
+        efficiency = {agent: statistics.sample_efficiency(curve, analysis.reps) for agent, curve in named.items()}
         points = {label(comparison, agent): fraction for agent, fraction in fractions.items()}
         caption = "IQM of evaluations along training; the last point is the final evaluation."
         caption += _intervals_are(analysis, "Bands are pointwise")
