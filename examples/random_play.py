@@ -41,7 +41,7 @@ def main() -> None:
     for name in ("classic", "minatar"):
         suite = choose(load_suite(name), None, None)
         for game in suite.games:
-            scores = play(suite.env_id.format(game=game), args.episodes, suite.evaluation["max_steps"])
+            scores = play(suite.env_id.format(game=game), args.episodes, suite.evaluation.max_steps)
             print(f"| {game} | {scores.mean():.2f} | {scores.std() / np.sqrt(len(scores)):.2f} |", flush=True)
 
 

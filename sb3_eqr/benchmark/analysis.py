@@ -2,16 +2,17 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark import statistics
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import SHOWN
-from sb3_eqr.benchmark.tables import aggregate_means, label, number, published, superhuman
+from sb3_eqr.benchmark.reference import SHOWN, PublishedMethod, load_reference, published_means
+from sb3_eqr.benchmark.tables import aggregate_means, distinct_best, number
 
-N_THRESHOLDS = 81  # of performance profiles
 FEW_RUNS = 5  # below, the percentile bootstrap is far too narrow
 
 
@@ -22,7 +23,6 @@ class Analysis:
     :param matrices: agent or reference -> (runs, games), normalised scores, games in alphabetical order
     :param aggregates: columns agent, metric, value, low, high
     :param means: rows games, columns published methods, raw mean scores
-    :param best: the agent of the benchmark with the highest IQM
     :param differences: of IQMs, against the first agent and against the best, see
         :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
     :param improvements: against the first agent, see :func:`~sb3_eqr.benchmark.statistics.improvement_probabilities`
@@ -33,15 +33,9 @@ class Analysis:
     matrices: dict[str, np.ndarray]
     aggregates: pd.DataFrame
     means: pd.DataFrame
-    best: str
     differences: pd.DataFrame
     improvements: pd.DataFrame
     reps: int
-
-    @property
-    def baseline(self) -> str:
-        """The first agent, a stock one where there is any."""
-        return self.comparison.agents[0]
 
 
 def analyse(comparison: Comparison, reps: int) -> Analysis:
@@ -50,45 +44,66 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
     :param reps: bootstrap samples
     """
     matrices = statistics.score_matrices(comparison.scores)
-    aggregates = statistics.aggregate(matrices, reps)
-    iqm = aggregates[aggregates["metric"] == "IQM"].set_index("agent")["value"]
-    best = str(iqm.reindex(comparison.agents).idxmax())
     baseline = comparison.agents[0]
+    best = max(comparison.agents, key=lambda agent: float(statistics.iqm(matrices[agent])))
     differences = statistics.iqm_differences(matrices, baseline, reps)
     if best != baseline:
         rest = {agent: matrix for agent, matrix in matrices.items() if agent != baseline}
         differences = pd.concat([differences, statistics.iqm_differences(rest, best, reps)], ignore_index=True)
-    improvements = statistics.improvement_probabilities(matrices, baseline, reps)
-    means = published(comparison, SHOWN)
-    return Analysis(comparison, matrices, aggregates, means, best, differences, improvements, reps)
+    return Analysis(
+        comparison,
+        matrices,
+        statistics.aggregate(matrices, reps),
+        published(comparison, SHOWN),
+        differences,
+        statistics.improvement_probabilities(matrices, baseline, reps),
+        reps,
+    )
 
 
-def thresholds(analysis: Analysis) -> np.ndarray:
+def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.DataFrame:
     """
-    :return: (n,) where profiles are evaluated: from 0, or below where many scores are, to where few scores are left
+    :return: rows games, columns methods, raw mean scores; without columns where a run has other steps than theirs, the suite
+        is not normalised by human scores, or a compared game has no published score
     """
-    scores = np.concatenate([matrix.ravel() for matrix in analysis.matrices.values()])
-    low = min(0.0, float(np.quantile(scores, 0.1)))
-    return np.linspace(low, max(1.0, low + 1.0, 1.05 * float(np.quantile(scores, 0.975))), N_THRESHOLDS)
+    means = published_means(methods, comparison.games if comparison.has_published else [])
+    return means if len(means) == len(comparison.games) else pd.DataFrame(index=comparison.games)
 
 
-def difference_in_words(row: dict, comparison: Comparison) -> str:
+def conclusion(analysis: Analysis) -> list[str]:
+    """
+    :return: what the runs show, the most important first
+    """
+    comparison = analysis.comparison
+    sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
+    own = {agent: analysis.matrices[agent] for agent in comparison.agents}
+    distinct = distinct_best(own, comparison.differing, analysis.reps)
+    if len(own) > 2 and any(distinct):
+        best = comparison.agents[distinct.index(True)]
+        sentences.insert(0, f"{comparison.label(best)} is the best agent: these runs distinguish it from every other one.")
+    elif len(own) > 2:
+        sentences.insert(0, "No agent is the best: the one with the highest IQM is not distinguished from all others.")
+    return sentences
+
+
+def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
     """
     :param row: of ``Analysis.differences``
-    :return: a sentence on whether the runs tell the two agents apart
+    :return: a sentence on whether the runs distinguish the two agents
     """
-    agent, other = label(comparison, row["agent"]), label(comparison, row["baseline"])
-    if row["difference"] == 0:
+    agent, other = comparison.label(row["agent"]), comparison.label(row["baseline"])
+    difference, detectable = row["difference"], row["detectable"]
+    if difference == 0:
         return f"{agent} and {other} have the same IQM."
-    size = _small(abs(row["difference"]))
-    side = "above" if row["difference"] >= 0 else "below"
-    if math.isnan(row["detectable"]):
-        return f"{agent} lies {size} {side} {other}: a single run does not show how much of that is chance."
+    size, side = _small(abs(difference)), "above" if difference > 0 else "below"
+    if math.isnan(detectable):
+        return f"The IQM of {agent} is {size} {side} that of {other}: a single run does not show how much of that is chance."
     runs = str(row["runs"]) if row["runs"] == row["baseline_runs"] else f"{row['runs']} and {row['baseline_runs']}"
-    shown = f"{runs} runs on {counted(row['games'], 'game')} show differences from {_small(row['detectable'])} on"
-    if abs(row["difference"]) < row["detectable"]:
-        return f"{agent} and {other} cannot be told apart: the difference is {size}, {shown}."
-    return f"{agent} lies {size} {side} {other}: {shown}."
+    shown = f"{runs} runs on {counted(row['games'], 'game')} can only detect differences above {_small(detectable)}"
+    if abs(difference) < detectable:
+        return f"{agent} and {other} cannot be distinguished with these runs: their IQMs differ by {size}, and {shown}."
+    verdict = "better" if difference > 0 else "worse"
+    return f"{agent} is {verdict} than {other}: its IQM is {size} {side}, and {shown.replace('only ', '')}."
 
 
 def _small(value: float) -> str:
@@ -101,20 +116,52 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+def notes(analysis: Analysis) -> list[str]:
+    """
+    :return: sentences that a reader must know before any number
+    """
+    comparison = analysis.comparison
+    found = [f"‡ {agent} was run under another protocol: {what}." for agent, what in comparison.differing.items()]
+    found += comparison.notes
+    if single := [agent for agent, matrix in analysis.matrices.items() if len(matrix) == 1]:
+        verb = "has" if len(single) == 1 else "have"
+        found.append(f"{', '.join(single)} {verb} a single run per game: no intervals, and another run may differ.")
+    if few := [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]:
+        found.append(
+            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. A bootstrap of so few is narrower than it should be: "
+            "trust the conclusion above rather than intervals that do not overlap."
+        )
+    return found
+
+
+def table_notes(analysis: Analysis) -> list[str]:
+    """
+    :return: what the table of games shows
+    """
+    comparison = analysis.comparison
+    found = [
+        "Raw scores: mean over runs ± standard deviation over runs. Bold: better than every other agent, by more than "
+        "chance explains.",
+        "Below: aggregates of normalised scores over all runs and games, with 95% intervals; "
+        f"{comparison.above_one} are those with a mean above 1.",
+    ]
+    if len(analysis.means.columns):
+        sources = load_reference().drop_duplicates("method").set_index("method")["source"]
+        found += [f"† {m.label}: 100K steps, game means only ({m.n_runs}), no interval. {sources[m.method]}." for m in SHOWN]
+    return found + [f"‡ {agent}: another protocol: {what}." for agent, what in comparison.differing.items()]
+
+
 def aggregates_file(analysis: Analysis) -> pd.DataFrame:
     """
     :return: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs
     """
     comparison = analysis.comparison
-    above = [
-        {"agent": agent, "metric": superhuman(comparison), "value": statistics.games_above(matrix)}
-        for agent, matrix in analysis.matrices.items()
-    ]
-    own = pd.concat([analysis.aggregates, pd.DataFrame(above)], ignore_index=True)
+    above = [(agent, comparison.above_one, statistics.games_above(matrix)) for agent, matrix in analysis.matrices.items()]
+    own = pd.concat([analysis.aggregates, pd.DataFrame(above, columns=["agent", "metric", "value"])], ignore_index=True)
     own["runs"] = [len(analysis.matrices[agent]) for agent in own["agent"]]
     own["from"] = "runs"
     known = aggregate_means(analysis.means, comparison).rename(columns={"label": "agent"})
-    known["metric"] = known["metric"].replace("above 1", superhuman(comparison))
+    known["metric"] = known["metric"].replace("above 1", comparison.above_one)
     known["runs"] = known["agent"].map({method.label: method.runs for method in SHOWN})
     known["from"] = "game means only"
     table = pd.concat([own, known], ignore_index=True) if len(known) else own
@@ -123,23 +170,6 @@ def aggregates_file(analysis: Analysis) -> pd.DataFrame:
     return table[["agent", "metric", "value", "low", "high", "runs", "games", "from", "protocol_differs"]]
 
 
-def notes(analysis: Analysis) -> list[str]:
-    """
-    :return: sentences that a reader must know before any number
-    """
-    comparison = analysis.comparison
-    found = [f"‡ {agent} was run under another protocol: {what}." for agent, what in comparison.differing.items()]
-    found += comparison.notes
-    single = [agent for agent, matrix in analysis.matrices.items() if len(matrix) == 1]
-    if single:
-        verb = "has" if len(single) == 1 else "have"
-        found.append(
-            f"{', '.join(single)} {verb} a single run per game: no intervals, and no say on what another run would do."
-        )
-    few = [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]
-    if few:
-        found.append(
-            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. A bootstrap of so few is narrower than it should be: "
-            'trust no interval that excludes another by little, and read "What the runs can show".'
-        )
-    return found
+def all_of(values: Iterable[Any]) -> str:
+    """:return: different values, in their order"""
+    return ", ".join(dict.fromkeys(map(str, values)))

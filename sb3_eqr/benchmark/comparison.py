@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game, read_runs
@@ -22,7 +23,6 @@ class Comparison:
     :param bounds: game -> (score that becomes 0, score that becomes 1)
     :param games: that every agent has runs on, in the suite's order
     :param agents: of the benchmark; the first is the one that the others are held against
-    :param references: methods whose runs were read from a file
     :param scores: columns agent, game, seed, raw, score (normalised); the runs that are compared, agents and references
     :param results: result.json of those runs
     :param episodes: every episode of every finished run, as ``score_table`` gives them
@@ -36,7 +36,6 @@ class Comparison:
     bounds: dict[str, tuple[float, float]]
     games: list[str]
     agents: list[str]
-    references: list[str]
     scores: pd.DataFrame
     results: list[dict[str, Any]]
     episodes: pd.DataFrame
@@ -49,30 +48,35 @@ class Comparison:
         return self.unit.startswith("human-normali")
 
     @property
-    def steps(self) -> set[int]:
-        """Training steps of the runs that are compared."""
-        return {result["protocol"]["steps"] for result in self.results}
+    def above_one(self) -> str:
+        """What games with a mean above 1 are called."""
+        return "superhuman games" if self.human else "games above 1"
 
-    def runs(self, agent: str) -> int:
-        """:return: how many runs per game are compared"""
-        return int(self.scores[self.scores["agent"] == agent]["seed"].nunique())
+    @property
+    def has_published(self) -> bool:
+        """Whether published scores are of as many steps as the runs."""
+        return self.human and {result["protocol"]["steps"] for result in self.results} == {PUBLISHED_STEPS}
+
+    def label(self, agent: str) -> str:
+        """:return: the agent's name, marked where its protocol is not that of the others"""
+        return f"{agent} ‡" if agent in self.differing else agent
+
+    def runs(self, agent: str) -> list[dict[str, Any]]:
+        """:return: the results of an agent; none of a reference"""
+        return [result for result in self.results if result["agent"] == agent]
+
+    def minutes(self, agent: str) -> float:
+        """:return: mean wall-clock time of a run; NaN of a reference"""
+        times = [result["wall_clock_s"] for result in self.runs(agent)]
+        return float(np.mean(times)) / 60 if times else np.nan
 
     def normalize(self, game: str, raw: Any) -> Any:
         """
         :param game: one of ``games``
         :param raw: score or array of scores
-        :return: the same, normalised
         """
-        return normalize(raw, self.bounds[game])
-
-
-def normalize(raw: Any, bounds: tuple[float, float]) -> Any:
-    """
-    :param raw: score or array of scores
-    :param bounds: the score that becomes 0, the score that becomes 1
-    """
-    low, high = bounds
-    return (raw - low) / (high - low)
+        low, high = self.bounds[game]
+        return (raw - low) / (high - low)
 
 
 def compare(
@@ -96,51 +100,52 @@ def compare(
     suites = [_read_suite(folder) for folder in folders]
     results = _of_agents(_load(folders), [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
-    all_games = list(dict.fromkeys(game for suite in suites for game in suite.games))
-    games, chosen, notes = choose_runs(results, all_games, force)
+    games, chosen, notes = choose_runs(results, list(dict.fromkeys(g for suite in suites for g in suite.games)), force)
     if baseline is not None and baseline not in chosen:
         raise ValueError(f"--baseline: expected one of {', '.join(chosen)}, found {baseline!r}")
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent))
     used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
+    used.sort(key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"]))
     notes += [*never_learn(used), *settings_differences(used)]
     differing = protocol_differences(used)
     if differing and not force:
-        told = " ".join(f"{agent}: {what}." for agent, what in differing.items())
         raise ValueError(
-            f"protocol: expected the same for every run of a game, found {told} "
+            "protocol: expected the same for every run of a game, found "
+            f"{' '.join(f'{agent}: {what}.' for agent, what in differing.items())} "
             "Choose with --agents, or pass --force to mark them in every table."
         )
-    episodes = score_table(results)
-    keys = [(result["agent"], result["game"], result["seed"]) for result in used]
-    scores = [_final_scores(episodes[pd.MultiIndex.from_frame(episodes[["agent", "game", "seed"]]).isin(keys)])]
-    known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
-    for name, path in references.items():
-        if name in agents:
-            raise ValueError(f"reference {name}: expected a name that no agent has, found the agent {name}. Rename it.")
-        runs = read_runs(path, name, games, known)
-        notes += [runs.attrs["note"]] if "note" in runs.attrs else []
-        scores.append(runs.rename(columns={"score": "raw"}))
-    order = [*agents, *references]
-    table = pd.concat(scores, ignore_index=True).sort_values("agent", key=lambda names: names.map(order.index), kind="stable")
-    table["score"] = [normalize(raw, bounds[game]) for game, raw in zip(table["game"], table["raw"], strict=True)]
-    if suites[0].normalisation["unit"].startswith("human-normali") and {r["protocol"]["steps"] for r in used} != {
-        PUBLISHED_STEPS
-    }:
-        notes.append("Published scores are of 100,000 training steps, these are not: they do not stand beside.")
-    return Comparison(
+    comparison = Comparison(
         suite=" + ".join(dict.fromkeys(suite.name for suite in suites)),
-        unit=suites[0].normalisation["unit"],
-        source=suites[0].normalisation["source"],
+        unit=suites[0].normalisation.unit,
+        source=suites[0].normalisation.source,
         bounds=bounds,
         games=games,
         agents=agents,
-        references=list(references),
-        scores=table.reset_index(drop=True),
-        results=sorted(used, key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"])),
-        episodes=episodes,
+        scores=pd.DataFrame(),
+        results=used,
+        episodes=score_table(results),
         differing=differing,
         notes=notes,
     )
+    if comparison.human and not comparison.has_published:
+        notes.append("Published scores are of 100,000 training steps, these are not: they do not stand beside.")
+    return dataclasses.replace(comparison, scores=_scores(comparison, references, suites))
+
+
+def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suites: list[Suite]) -> pd.DataFrame:
+    """:return: columns agent, game, seed, raw, score; a note for each reference with runs to spare"""
+    final = score_table(comparison.results).query("kind == 'final'")
+    tables = [final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()]
+    known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
+    for name, path in references.items():
+        if name in comparison.agents:
+            raise ValueError(f"reference {name}: expected a name that no agent has, found the agent {name}. Rename it.")
+        runs = read_runs(path, name, comparison.games, known)
+        comparison.notes.extend([runs.attrs["note"]] if "note" in runs.attrs else [])
+        tables.append(runs.rename(columns={"score": "raw"}))
+    table = pd.concat(tables, ignore_index=True)
+    table["score"] = [comparison.normalize(game, raw) for game, raw in zip(table["game"], table["raw"], strict=True)]
+    return table
 
 
 def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[str, Any]]:
@@ -192,13 +197,14 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
     """
     bounds: dict[str, tuple[float, float]] = {}
     for suite in suites:
-        if suite.normalisation["unit"] != suites[0].normalisation["unit"]:
+        unit = suites[0].normalisation.unit
+        if suite.normalisation.unit != unit:
             raise ValueError(
-                f"normalisation: expected one unit, found {suites[0].normalisation['unit']!r} in {suites[0].name} and "
-                f"{suite.normalisation['unit']!r} in {suite.name}. Report them apart."
+                f"normalisation: expected one unit, found {unit!r} in {suites[0].name} and "
+                f"{suite.normalisation.unit!r} in {suite.name}. Report them apart."
             )
-        for game, (low, high) in suite.normalisation["scores"].items():
-            if low == high or bounds.setdefault(game, (low, high)) != (low, high):
+        for game, (low, high) in suite.normalisation.scores.items():
+            if bounds.setdefault(game, (low, high)) != (low, high):
                 raise ValueError(
                     f"normalisation of {game}: expected two bounds, the same in all folders, found {low} and {high} in "
                     f"{suite.name} and {bounds.get(game)} before. Correct suite.yml."
@@ -211,11 +217,3 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
                 "Correct the name, or add the game under normalisation: scores in suite.yml."
             )
     return bounds
-
-
-def _final_scores(episodes: pd.DataFrame) -> pd.DataFrame:
-    """
-    :return: columns agent, game, seed, raw: the mean score over the episodes of the final evaluation
-    """
-    final = episodes[episodes["kind"] == "final"]
-    return final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()

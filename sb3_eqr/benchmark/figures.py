@@ -1,279 +1,360 @@
 """
-The figures of a report: counterparts of Figures 4 to 7 of the EqR paper, and curves along training.
-
-Each function draws one figure with ``columns`` panels beside each other: two or more for paper, one for a phone. What belongs
-to an agent looks the same in all of them, and differs in more than its colour.
+The figures of a report, drawn by rliable and seaborn: counterparts of Figures 4 to 7 of the EqR paper, and curves along
+training.
 """
 
+import base64
 import io
-import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
+import seaborn as sns
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from rliable import plot_utils
 
-DPI = 200
-PANEL = 3.7  # inches, width of a panel; at one panel a phone shows the letters about as large as its text
-BAND = 0.14  # opacity of intervals around curves
-INK, GREY = "#222222", "#6b6b6b"
-HEADINGS = {"IQM": "Interquartile mean", "optimality gap": "Optimality gap", "median": "Median", "mean": "Mean"}
-SETTINGS: Any = {
-    "font.family": "STIXGeneral",  # comes with matplotlib
-    "mathtext.fontset": "stix",
-    "font.size": 10.5,
-    "axes.titlesize": 11.5,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "legend.frameon": False,
-    "legend.handlelength": 3.2,
-    "lines.linewidth": 1.5,
-    "lines.markersize": 5,
-    "hatch.linewidth": 0.5,
+from sb3_eqr.benchmark import statistics
+from sb3_eqr.benchmark.analysis import Analysis, published
+from sb3_eqr.benchmark.comparison import Comparison
+from sb3_eqr.benchmark.reference import SHOWN, SHOWN_GROUPS, SHOWN_LOSSES, PublishedMethod
+from sb3_eqr.benchmark.scores import evaluation_curve
+from sb3_eqr.benchmark.tables import aggregate_means
+from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, settings
+
+DPI = 160
+N_THRESHOLDS = 81  # of performance profiles
+N_LOSSES = 20  # points of a curve of losses
+SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's own are for slides
+INTERVALS = "95% stratified bootstrap intervals"
+# The agents of Figure 5 (b) and of Figure 6, by the names that agents have in a benchmark.
+ABLATIONS = {
+    "loss_components": (r"(eqr_\w+):se2\+aet.*", "Losses", SHOWN_LOSSES, "losses, as in Figure 5 (b) of the EqR paper"),
+    "groups": (r"(eqr_\w+):(mlp|t2|se2|gl2)\+aet\+r", "Groups", SHOWN_GROUPS, "group, as in Figure 6 of the EqR paper"),
 }
 
 
-class Look(NamedTuple):
-    """How an agent is drawn."""
-
-    color: str
-    line: tuple[float, tuple[float, ...]]  # lengths of strokes and gaps
-    marker: str
-    hatch: str
-
-
-# Okabe and Ito's colours (https://jfly.uni-koeln.de/color), from dark to light, told apart by the colour-blind, too
-COLORS = ("#000000", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-LINES = ((0, ()), (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (8, 2, 1, 2, 1, 2)), (0, (3, 3)))
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")
-HATCHES = ("", "///", "...", "\\\\\\", "xxx", "|||", "---", "+++")
-
-
-def looks(agents: Sequence[str]) -> dict[str, Look]:
-    """
-    :param agents: in the order of the report
-    :return: agent -> how it is drawn; lines and markers are cycles of different length, so that no two of the first 66 are
-        alike without colours
-    """
-    return {
-        agent: Look(COLORS[i % len(COLORS)], LINES[i % len(LINES)], MARKERS[i % len(MARKERS)], HATCHES[i % len(HATCHES)])
-        for i, agent in enumerate(agents)
-    }
-
-
-@contextmanager
-def settings() -> Iterator[None]:
-    """Matplotlib's settings for the figures of a report, put back afterwards."""
-    with matplotlib.rc_context(SETTINGS):
-        yield
-
-
-def to_png(figure: Figure) -> bytes:
-    """
-    :return: the same bytes for the same figure
-    """
-    file = io.BytesIO()
-    with settings():
-        figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
-    return file.getvalue()
-
-
-def _panels(count: int, columns: int, width: float, height: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    columns = min(columns, count)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey).flatten().tolist()
-    for unused in axes[count:]:
-        unused.set_visible(False)
-    return figure, axes[:count]
-
-
-def _legend(figure: Figure, drawn: Mapping[str, Look], columns: int, markers: bool = True) -> None:
-    """A legend below all panels, as wide as they are, for which the figure grows."""
-    handles = [
-        Line2D([], [], color=look.color, linestyle=look.line, marker=look.marker if markers else "", label=agent)
-        for agent, look in drawn.items()
-    ]
-    longest = max(map(len, drawn))
-    fitting = max(1, min(len(handles), int(figure.get_figwidth() / (0.65 + 0.073 * longest))))
-    figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(handles) // fitting) + 0.1)
-    figure.legend(handles=handles, loc="outside lower center", ncols=fitting, fontsize=9.5)
-
-
-def _letters(axes: list[Axes], titles: list[str]) -> None:
-    for letter, ax, title in zip("abcdefgh", axes, titles, strict=False):
-        ax.set_title(f"({letter}) {title}" if len(axes) > 1 else title, loc="left", color=INK)
-
-
-def profile_figure(
-    profiles: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]],
-    thresholds: np.ndarray,
-    unit: str,
-    style: Mapping[str, Look],
-    columns: int,
-) -> Figure:
-    """
-    Figure 4: fractions of runs, or of games, above a score.
-
-    :param profiles: heading of the panel -> agent -> fraction, low, high (n,) each
-    :param thresholds: (n,)
-    """
-    with settings():
-        figure, axes = _panels(len(profiles), columns, PANEL, 2.8)
-        for ax, by_agent in zip(axes, profiles.values(), strict=True):
-            for agent, (value, low, high) in by_agent.items():
-                _curve(ax, thresholds, value, low, high, style[agent], every=max(1, len(thresholds) // 8))
-            ax.set(xlabel=f"{textwrap.fill(unit, 40)} ($\\tau$)", ylim=(-0.02, 1.02), xlim=(thresholds[0], thresholds[-1]))
-        axes[0].set_ylabel("Fraction with score > $\\tau$")
-        _letters(axes, list(profiles))
-        _legend(figure, {agent: style[agent] for agent in next(iter(profiles.values()))}, columns)
-        return figure
-
-
-def _curve(ax: Axes, x: np.ndarray, value: np.ndarray, low: np.ndarray, high: np.ndarray, look: Look, every: int = 1) -> None:
-    """A curve in its interval; the hatch tells bands apart without colours."""
-    ax.plot(x, value, color=look.color, linestyle=look.line, marker=look.marker, markevery=every)
-    if not np.isnan(low).all():
-        ax.fill_between(x, low, high, facecolor=look.color, edgecolor=look.color, alpha=BAND, linewidth=0, hatch=look.hatch)
-
-
-def interval_figure(
-    aggregates: pd.DataFrame, published: pd.DataFrame, unit: str, style: Mapping[str, Look], columns: int
-) -> Figure:
-    """
-    Figures 5 and 6: aggregates with their intervals, and points without one for methods of which game means are known.
-
-    :param aggregates: columns agent, metric, value, low, high
-    :param published: columns label, metric, value; may be empty
-    """
-    agents, labels = aggregates["agent"].unique().tolist(), published["label"].unique().tolist()
-    names = [*agents, *labels]
-    with settings():
-        figure, axes = _panels(len(HEADINGS), columns, PANEL + 0.2, 0.9 + 0.21 * len(names), sharey=True)
-        for ax, metric in zip(axes, HEADINGS, strict=True):
-            for row in aggregates[aggregates["metric"] == metric].to_dict("records"):
-                look, place = style[row["agent"]], agents.index(row["agent"])
-                if not np.isnan(row["low"]):
-                    ax.plot([row["low"], row["high"]], [place, place], color=look.color, linewidth=5, alpha=0.3)
-                    ax.plot([row["low"], row["high"]], [place, place], "|", color=look.color, markersize=8)
-                ax.plot(row["value"], place, look.marker, color=look.color)
-            points = published[published["metric"] == metric]
-            ax.plot(points["value"], [names.index(n) for n in points["label"]], "o", color=GREY, markerfacecolor="white")
-            ax.set_xlabel(unit)
-            ax.margins(x=0.09)
-            ax.xaxis.set_major_locator(MaxNLocator(5))
-            ax.grid(visible=False, axis="y")
-        axes[0].set_ylim(len(names) - 0.4, -0.6)
-        axes[0].set_yticks(range(len(names)), names)
-        for ax in axes:
-            ax.tick_params(axis="y", length=0)
-            if labels:
-                ax.axhline(len(agents) - 0.5, color=GREY, linewidth=0.6)
-        _letters(axes, list(HEADINGS.values()))
-        return figure
-
-
-def improvement_figure(probabilities: pd.DataFrame, style: Mapping[str, Look], columns: int) -> Figure:
-    """
-    :param probabilities: columns agent, baseline, value, low, high, of one baseline
-    """
-    with settings():
-        figure, (ax,) = _panels(1, columns, PANEL if columns == 1 else 1.75 * PANEL, 0.9 + 0.24 * len(probabilities))
-        for place, row in enumerate(probabilities.to_dict("records")):
-            look = style[row["agent"]]
-            if not np.isnan(row["low"]):
-                ax.plot([row["low"], row["high"]], [place, place], color=look.color, linewidth=5, alpha=0.3)
-                ax.plot([row["low"], row["high"]], [place, place], "|", color=look.color, markersize=8)
-            ax.plot(row["value"], place, look.marker, color=look.color)
-        ax.axvline(0.5, color=INK, linewidth=0.8, linestyle=(0, (2, 2)))
-        ax.set(xlim=(-0.02, 1.02), ylim=(len(probabilities) - 0.4, -0.6))
-        ax.set_xlabel(f"P(a run scores higher than one of {probabilities['baseline'].iloc[0]})")
-        ax.set_yticks(range(len(probabilities)), probabilities["agent"])
-        ax.tick_params(axis="y", length=0)
-        ax.grid(visible=False, axis="y")
-        return figure
-
-
-def efficiency_figure(
-    fractions: Mapping[str, np.ndarray],
-    curves: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
-    axis: tuple[str, float],
-    unit: str,
-    style: Mapping[str, Look],
-    columns: int,
-) -> Figure:
-    """
-    :param fractions: agent -> fraction of the training steps (points,)
-    :param curves: agent -> IQM, low, high (points,) each
-    :param axis: label of the horizontal axis, and what a fraction of 1 is on it
-    """
-    with settings():
-        figure, (ax,) = _panels(1, columns, PANEL if columns == 1 else 1.75 * PANEL, 3.0)
-        label, whole = axis
-        for agent, (value, low, high) in curves.items():
-            _curve(ax, fractions[agent] * whole, value, low, high, style[agent])
-        ax.set(xlabel=label, ylabel=textwrap.fill(f"IQM, {unit}", 32))
-        ax.set_xlim(left=0)
-        _legend(figure, {agent: style[agent] for agent in curves}, columns)
-        return figure
-
-
-def small_multiples(
-    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], ylabel: str, style: Mapping[str, Look], columns: int
-) -> Figure:
-    """
-    A panel per game, with the mean over runs within one standard deviation; Figure 7 where the curves are losses.
-
-    :param curves: game -> agent -> steps (points,), values (runs, points)
-    """
-    wide = 2 if columns == 1 else 4 if len(curves) > 9 else 3
-    with settings():
-        figure, axes = _panels(len(curves), wide, PANEL * columns / wide if len(curves) > 1 else PANEL, 1.9)
-        for place, (ax, (game, by_agent)) in enumerate(zip(axes, curves.items(), strict=True)):
-            for agent, (steps, values) in by_agent.items():
-                mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1) if len(values) > 1 else np.nan
-                every = max(1, len(steps) // 5)
-                _curve(ax, steps / 1_000, mean, mean - spread, mean + spread, style[agent], every)
-            ax.set_title(game, loc="left", color=INK, fontsize=10.5)
-            ax.xaxis.set_major_locator(MaxNLocator(4))
-            ax.yaxis.set_major_locator(MaxNLocator(4))
-            if max(np.abs(ax.get_ylim())) >= 10_000:
-                ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 1_000:g}k" if value else "0"))
-            ax.tick_params(labelsize=9)
-            if place % wide == 0:
-                ax.set_ylabel(ylabel, fontsize=9.5)
-            if place + wide >= len(curves):
-                ax.set_xlabel("steps (thousands)", fontsize=9.5)
-        drawn = {agent: style[agent] for agent in style if any(agent in by_agent for by_agent in curves.values())}
-        _legend(figure, drawn, columns)
-        return figure
-
-
-class Picture(NamedTuple):
+class ReportFigure(NamedTuple):
     """
     :param name: of the file, without suffix
     :param title: heading in the report
     :param caption: what is shown, plain text
-    :param draw: number of columns -> figure
     """
 
     name: str
     title: str
     caption: str
-    draw: Callable[[int], Figure]
+    figure: Figure
+
+    @staticmethod
+    def encoded(png: bytes) -> str:
+        """For the page."""
+        return base64.b64encode(png).decode()
+
+    @staticmethod
+    def width(png: bytes) -> int:
+        """In pixels of the page, of which the picture has two each."""
+        return int.from_bytes(png[16:20], "big") // 2
+
+
+def to_png(shown: ReportFigure) -> bytes:
+    """
+    :return: the same bytes for the same figure, which is closed
+    """
+    file = io.BytesIO()
+    for ax in shown.figure.axes:
+        ax.spines[:].set_linewidth(SETTINGS["axes.linewidth"])  # rliable draws thick ones
+    with settings():
+        shown.figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", metadata={"Software": None})
+    plt.close(shown.figure)
+    return file.getvalue()
+
+
+def all_figures(analysis: Analysis) -> list[ReportFigure]:
+    """
+    :return: the figures that have something to show
+    """
+    style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
+    best = "Best is a high IQM, median and mean and a low optimality gap, as Figure 5 (a) of the EqR paper."
+    with settings():
+        return [
+            _profiles(analysis, style),
+            _intervals(analysis, style, "aggregates", "Aggregate scores", list(analysis.matrices), SHOWN, best),
+            *_ablations(analysis, style),
+            *_improvements(analysis, style),
+            *_sample_efficiency(analysis, style),
+            *_along_training(analysis.comparison, style),
+        ]
+
+
+def _bands(analysis: Analysis, beginning: str) -> str:
+    """:return: a sentence on the intervals, "" where all agents have a single run"""
+    return "" if analysis.aggregates["low"].isna().all() else f" {beginning} {INTERVALS}."
+
+
+def _legend(figure: Figure, style: Mapping[str, Look]) -> None:
+    lines = [plt.Line2D([], [], color=look.color, linestyle=look.line, marker=look.marker) for look in style.values()]
+    figure.legend(lines, list(style), loc="outside lower center", ncols=min(len(style), 3))
+
+
+def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
+    """
+    :return: (n,) where profiles are evaluated: from 0, or below where many scores are, to where few scores are left
+    """
+    scores = np.concatenate([matrix.ravel() for matrix in matrices.values()])
+    low = min(0.0, float(np.quantile(scores, 0.1)))
+    return np.linspace(low, max(1.0, low + 1.0, 1.05 * float(np.quantile(scores, 0.975))), N_THRESHOLDS)
+
+
+def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
+    taus = thresholds(analysis.matrices)
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
+    kinds = {"runs": statistics.performance_profile, "games": statistics.average_score_profile}
+    for ax, (what, profile) in zip(axes, kinds.items(), strict=True):
+        found = {analysis.comparison.label(a): profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
+        plot_utils.plot_performance_profiles(
+            {agent: value for agent, (value, _, _) in found.items()},
+            taus,
+            {agent: ends for agent, (_, *ends) in found.items()},
+            ax=ax,
+            colors={agent: look.color for agent, look in style.items()},
+            linestyles={agent: look.line for agent, look in style.items()},
+            xlabel=f"score τ ({analysis.comparison.unit})",
+            ylabel=f"fraction of {what} above τ",
+            **SIZES,
+        )
+        for line, look in zip(ax.get_lines(), style.values(), strict=True):
+            line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
+    _legend(figure, style)
+    caption = (
+        "Fraction of runs (left) and of games, by their mean over runs (right), above a score, as Figure 4 of the EqR paper. "
+        f"The higher the curve, the better.{_bands(analysis, 'Bands are pointwise')}"
+    )
+    return ReportFigure("profiles", "Performance profiles", caption, figure)
+
+
+def _intervals(
+    analysis: Analysis,
+    style: Mapping[str, Look],
+    name: str,
+    title: str,
+    agents: Sequence[str],
+    methods: Sequence[PublishedMethod],
+    explained: str,
+) -> ReportFigure:
+    comparison, metrics = analysis.comparison, list(statistics.METRICS)
+    by_agent = analysis.aggregates.set_index(["agent", "metric"])
+    points = {comparison.label(a): by_agent.loc[a].loc[metrics, "value"].to_numpy() for a in agents}
+    ends = {comparison.label(a): by_agent.loc[a].loc[metrics, ["low", "high"]].to_numpy().T for a in agents}
+    known = aggregate_means(published(comparison, methods), comparison).pivot(index="label", columns="metric", values="value")
+    for method in methods:
+        if method.label in known.index:
+            points[f"{method.label}, {method.n_runs}"] = known.loc[method.label, metrics].to_numpy()
+            ends[f"{method.label}, {method.n_runs}"] = np.full((2, len(metrics)), np.nan)
+    colors = {label: style[label].color if label in style else GREY for label in points}
+    figure, axes = plot_utils.plot_interval_estimates(
+        points, ends, metrics, colors=colors, subfigure_width=2.2, row_height=0.3, xlabel="", interval_height=0.6
+    )
+    for ax in axes:
+        ax.invert_yaxis()
+        ax.set_title(ax.get_title(), fontsize="large")
+        ax.tick_params(labelsize="medium", length=2)
+        ax.set_xlabel(comparison.unit, fontsize="small")
+        places = range(len(points))
+        ax.plot([values[list(axes).index(ax)] for values in points.values()], places, "o", color=INK, markersize=3)
+    caption = f"{explained} Over all runs and games.{_bands(analysis, 'Bars are')}"
+    if len(known):
+        caption += (
+            " Points without a bar are published game means, over as many runs as named. The IQM and the optimality gap of "
+            "game means are not quite those of runs."
+        )
+    return ReportFigure(name, title, caption, figure)
+
+
+def _ablations(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
+    found = []
+    for name, (pattern, title, methods, what) in ABLATIONS.items():
+        by_algorithm: dict[str, list[str]] = {}
+        for agent in analysis.comparison.agents:
+            if match := re.fullmatch(pattern, agent):
+                by_algorithm.setdefault(match[1], []).append(agent)
+        for algorithm, agents in by_algorithm.items():
+            if len(agents) > 1:
+                names = f"{name}_{algorithm}", f"{title} of {algorithm}"
+                found.append(_intervals(analysis, style, *names, agents, methods, f"Agents that differ in their {what}."))
+    return found
+
+
+def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
+    rows, label = analysis.improvements.to_dict("records"), analysis.comparison.label
+    if not rows:
+        return []
+    baseline = label(rows[0]["baseline"])
+    figure, ax = plt.subplots(figsize=(5, 0.6 + 0.3 * len(rows)))
+    plot_utils.plot_probability_of_improvement(
+        {f"{label(row['agent'])}|{baseline}": row["value"] for row in rows},
+        {f"{label(row['agent'])}|{baseline}": (row["low"], row["high"]) for row in rows},
+        pair_separator="|",
+        ax=ax,
+        colors=[style[label(row["agent"])].color for row in rows],
+        xlabel=f"P(a run scores higher than one of {baseline})",
+        left_ylabel="",
+        right_ylabel="",
+        **SIZES,
+    )
+    figure.axes[-1].set_yticks([])  # the baseline again and again
+    ax.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
+    ax.set_xlim(-0.02, 1.02)
+    caption = (
+        f"How likely a run of an agent scores higher than one of {baseline}, the baseline (--baseline, or the "
+        f"first stock agent), averaged over games.{_bands(analysis, 'Bars are')}"
+    )
+    return [ReportFigure("improvement", "Probability of improvement", caption, figure)]
+
+
+def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """
+    :return: agent -> fractions of the training steps (points,), normalised scores (runs, games, points); without agents whose
+        runs share fewer than two points
+    """
+    curves = {}
+    for agent in comparison.agents:
+        by_run = {}
+        for run in comparison.runs(agent):
+            steps, raw = evaluation_curve(run)
+            shares = np.round(steps / steps[-1], 2)  # games may differ in steps, and a curve's points in rounding
+            by_run[run["seed"], run["game"]] = pd.Series(comparison.normalize(run["game"], raw), index=shares)
+        table = pd.DataFrame(by_run).dropna()  # points by runs
+        if len(table) > 1:
+            seeds = sorted({seed for seed, _ in by_run})
+            values = [[table[seed, game].to_numpy() for game in comparison.games] for seed in seeds]
+            curves[agent] = table.index.to_numpy(), np.array(values)
+    return curves
+
+
+def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
+    comparison = analysis.comparison
+    curves = normalized_curves(comparison)
+    if not curves:
+        return []
+    steps = {result["protocol"]["steps"] for result in comparison.results}
+    whole, axis = (steps.pop() / 1_000, "training steps (thousands)") if len(steps) == 1 else (1.0, "share of the steps")
+    figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    shown = {}
+    for agent, (fractions, scores) in curves.items():
+        value, low, high = statistics.sample_efficiency(scores, analysis.reps)
+        label = comparison.label(agent)
+        shown[label] = look = style[label]
+        plot_utils.plot_sample_efficiency_curve(
+            fractions * whole,
+            {label: value},
+            {label: (low, high)},
+            colors={label: look.color},
+            ax=ax,
+            xlabel=axis,
+            ylabel=f"IQM ({comparison.unit})",
+            marker=look.marker,
+            linewidth=1.5,
+            **SIZES,
+        )
+        ax.get_lines()[-1].set_linestyle(look.line)
+    ax.set_xlim(left=0)
+    _legend(figure, shown)
+    caption = "IQM of evaluations along training; the last point is the final evaluation."
+    caption += _bands(analysis, "Bands are pointwise")
+    return [ReportFigure("sample_efficiency", "Sample efficiency", caption, figure)]
+
+
+def learning_curves(comparison: Comparison) -> pd.DataFrame:
+    """
+    :return: columns game, agent, seed, step, value: raw mean scores at the evaluations along training; without the agents
+        that were evaluated at the end only
+    """
+    frames = []
+    for run in comparison.results:
+        steps, scores = evaluation_curve(run)
+        if len(steps) > 1:
+            frames.append(_rows(run, comparison, steps, scores))
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+
+
+def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
+    """
+    :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21 as far as the agent has them, means over
+        twentieths of the training; without the agents that have neither
+    """
+    frames = []
+    for run in comparison.results:
+        rows = [row for row in run.get("losses", []) if "aet_loss" in row or "symmetry_loss" in row]
+        if len(rows) > 1:
+            table = pd.DataFrame(rows).reindex(columns=["step", "aet_loss", "symmetry_loss"]).fillna(0.0)
+            part = run["protocol"]["steps"] / N_LOSSES
+            ends = np.ceil(table["step"] / part) * part
+            means = (table["aet_loss"] + table["symmetry_loss"]).groupby(ends).mean()
+            frames.append(_rows(run, comparison, means.index.to_numpy(), means.to_numpy()))
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+
+
+def _rows(run: dict[str, Any], comparison: Comparison, steps: np.ndarray, values: np.ndarray) -> pd.DataFrame:
+    named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
+    return pd.DataFrame({"step": steps / 1_000, "value": values}).assign(**named)
+
+
+def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
+    found = []
+    for name, title, table, ylabel, caption in (
+        (
+            "learning_curves",
+            "Learning curves",
+            learning_curves(comparison),
+            "mean raw score",
+            "Raw scores of evaluations along training.",
+        ),
+        (
+            "symmetry_losses",
+            "Symmetry losses",
+            symmetry_losses(comparison),
+            "$L_{AET} + L_{GET}$",
+            "L_AET + L_GET along training, as Figure 7 of the EqR paper; the one that an agent has where it has not both.",
+        ),
+    ):
+        if len(table):
+            band = " Means over runs within one standard deviation."
+            band = band if table["seed"].nunique() > 1 else " A single run each."
+            shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
+            found.append(ReportFigure(name, title, caption + band, _small_multiples(table, ylabel, shown)))
+    return found
+
+
+def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]) -> Figure:
+    """A panel per game: mean over runs, and their standard deviation."""
+    grid = sns.relplot(
+        table,
+        x="step",
+        y="value",
+        col="game",
+        hue="agent",
+        style="agent",
+        hue_order=list(style),
+        style_order=list(style),
+        palette={agent: look.color for agent, look in style.items()},
+        markers={agent: look.marker for agent, look in style.items()},
+        dashes=True,
+        kind="line",
+        errorbar="sd",
+        markeredgewidth=0,
+        col_wrap=min(3, table["game"].nunique()),
+        height=2.1,
+        aspect=1.25,
+        legend=False,
+        facet_kws={"sharey": False},
+    )
+    for ax in grid.axes.flat:
+        for line, look in zip(ax.get_lines(), style.values(), strict=False):
+            line.set_linestyle(look.line)
+    grid.figure.set_layout_engine("constrained")
+    grid.set_titles("{col_name}").set_axis_labels("steps (thousands)", ylabel)
+    _legend(grid.figure, style)
+    return grid.figure

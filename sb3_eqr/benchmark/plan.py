@@ -1,6 +1,5 @@
 """What a benchmark is to run, and where it stands: folders of runs, the same for every process that looks at them."""
 
-import dataclasses
 import json
 import pathlib
 from typing import Any, NamedTuple
@@ -99,9 +98,10 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
         if old.name != suite.name:
             raise ValueError(f"{folder}: expected a benchmark of suite {suite.name!r}, found one of {old.name!r}")
         games = [*old.games, *(game for game in suite.games if game not in old.games)]
-        scores = old.normalisation["scores"] | suite.normalisation["scores"]
-        normalisation = suite.normalisation | {"scores": scores}
-        suite = dataclasses.replace(suite, games=games, steps=old.steps | suite.steps, normalisation=normalisation)
+        scores = old.normalisation.scores | suite.normalisation.scores
+        normalisation = suite.normalisation.model_copy(update={"scores": scores})
+        update = {"games": games, "steps": old.steps | suite.steps, "normalisation": normalisation}
+        suite = suite.model_copy(update=update)
     write_suite(suite, path)
     for run in runs:
         run.folder.mkdir(parents=True, exist_ok=True)

@@ -1,24 +1,35 @@
 """The report of a benchmark: from folders of runs to a page, figures, tables and data files."""
 
+import importlib.metadata
 import io
+import json
 import pathlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import jinja2
+import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
-from sb3_eqr.benchmark import sections
-from sb3_eqr.benchmark.analysis import Analysis, aggregates_file, analyse, notes
-from sb3_eqr.benchmark.comparison import compare
-from sb3_eqr.benchmark.pictures import all_pictures
-from sb3_eqr.benchmark.tables import Table, game_table, summary_table, to_html, to_latex, to_markdown
+from sb3_eqr.benchmark.analysis import Analysis, aggregates_file, all_of, analyse, conclusion, counted, notes, table_notes
+from sb3_eqr.benchmark.comparison import Comparison, compare
+from sb3_eqr.benchmark.figures import all_figures, to_png
+from sb3_eqr.benchmark.selection import flatten
+from sb3_eqr.benchmark.statistics import REPS
+from sb3_eqr.benchmark.tables import (
+    Table,
+    game_table,
+    make_table,
+    number,
+    summary_table,
+    to_html,
+    to_latex,
+    to_markdown,
+)
 from sb3_eqr.common.files import atomic_write
 
-REPS = 2_000  # bootstrap samples, as rliable's profiles
-METHOD = (
-    "Statistics are those of rliable (Agarwal et al. 2021). The interquartile mean (IQM) is the mean of the middle half of "
-    "all runs and games, the optimality gap is how far scores stay below 1 on average. Intervals hold 95% of the samples of a "
-    "bootstrap that draws the runs of each game anew and keeps the games. A run's score is the mean of its final evaluation."
-)
+TEMPLATE = pathlib.Path(__file__).with_name("report.html.jinja")
 
 
 def write_report(
@@ -47,33 +58,54 @@ def write_report(
     """
     comparison = compare(folders, references, force, agents, baseline)
     analysis = analyse(comparison, reps)
-    table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means)
-    figures, files = sections.draw(all_pictures(analysis))
-    files |= _data_files(comparison.episodes, aggregates_file(analysis))
-    files |= _table_files(analysis, table)
-    without = [] if "scores.parquet" in files else ["scores.parquet was left out: it needs pyarrow (pip install pyarrow)."]
-    content = [
-        (
-            "Aggregates",
-            sections.paragraph(METHOD) + to_html(summary_table(comparison, analysis.aggregates, analysis.matrices)),
-        ),
-        ("Figures", figures),
-    ]
-    if not analysis.differences.empty:
-        content.append(("What the runs can show", sections.differences(analysis)))
-    content.append(("Scores per game", to_html(table) + sections.bullets(sections.game_table_notes(analysis))))
-    if comparison.human:
-        content.append(("Published last rows", sections.published_rows()))
-    content.append(("Settings", sections.settings(comparison, command)))
-    title = f"Benchmark {comparison.suite}"
-    page = sections.page(title, sections.lead(comparison), [*notes(analysis), *without], content)
+    figures = all_figures(analysis)
+    table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
+    files = {f"{figure.name}.png": to_png(figure) for figure in figures}
+    files |= _data_files(comparison.episodes, aggregates_file(analysis)) | _table_files(analysis, table)
+    before = notes(analysis)
+    if "scores.parquet" not in files:
+        before.append("scores.parquet was left out: it needs pyarrow (pip install pyarrow).")
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    page = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        title=f"Benchmark {comparison.suite}",
+        style=Markup(TEMPLATE.with_name("report.css").read_text(encoding="utf-8")),
+        lead=_lead(comparison),
+        conclusion=conclusion(analysis),
+        notes=before,
+        summary=_html(summary_table(comparison, analysis.aggregates, analysis.matrices, reps)),
+        figures=[(figure, files[f"{figure.name}.png"]) for figure in figures],
+        human=comparison.human,
+        games=_html(table),
+        about_games=table_notes(analysis),
+        settings=_settings(comparison),
+        commands=_commands(comparison, command),
+        versions=all_of(f"{name} {importlib.metadata.version(name)}" for name in ("rliable", "numpy", "scipy", "pandas")),
+    )
     files["report.html"] = page.encode()  # last: who finds it finds the rest
-    for note in notes(analysis):
+    for note in before:
         print(f"Note: {note}")
-    for name, content_bytes in files.items():
+    for name, content in files.items():
         with atomic_write(pathlib.Path(output) / name, pathlib.Path(name).suffix[1:]) as file:
-            file.write(content_bytes)
+            file.write(content)
     return pathlib.Path(output) / "report.html"
+
+
+def _html(table: Table, kind: str = "numbers") -> Markup:
+    return Markup(to_html(table, kind))  # noqa: S704: its cells are escaped
+
+
+def _lead(comparison: Comparison) -> str:
+    """What was measured, in two sentences."""
+    runs = sorted({len(comparison.runs(agent)) // len(comparison.games) for agent in comparison.agents})
+    days = sorted(result["started"][:10] for result in comparison.results)
+    per_game = counted(runs[0], "run") if len(runs) == 1 else f"{runs[0]} to {runs[-1]} runs"
+    when = f"on {days[0]}" if days[0] == days[-1] else f"from {days[0]} to {days[-1]}"
+    return (
+        f"{counted(len(comparison.agents), 'agent')} on {counted(len(comparison.games), 'game')}, "
+        f"{per_game} of each per game, started {when}. Normalised scores: {comparison.unit} ({comparison.source})."
+    )
 
 
 def _data_files(episodes: pd.DataFrame, aggregates: pd.DataFrame) -> dict[str, bytes]:
@@ -93,7 +125,61 @@ def _data_files(episodes: pd.DataFrame, aggregates: pd.DataFrame) -> dict[str, b
 
 
 def _table_files(analysis: Analysis, table: Table) -> dict[str, bytes]:
-    about = [*notes(analysis), *sections.game_table_notes(analysis)]
+    about = [*conclusion(analysis), *notes(analysis), *table_notes(analysis)]
     markdown = "\n".join([to_markdown(table), *(f"- {note}" for note in about), ""])
-    latex = "".join(f"% {note}\n" for note in about) + to_latex(table)
-    return {"table.md": markdown.encode(), "table.tex": latex.encode()}
+    return {"table.md": markdown.encode(), "table.tex": ("".join(f"% {note}\n" for note in about) + to_latex(table)).encode()}
+
+
+def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
+    """Headings, and tables of what each agent ran with, and where."""
+    rows = []
+    for agent in comparison.agents:
+        runs = comparison.runs(agent)
+        rows.append(
+            [
+                comparison.label(agent),
+                all_of(sorted({run["seed"] for run in runs})),
+                all_of(f"{run['machine']['device']}, {run['machine'].get('platform', '')}" for run in runs),
+                all_of(run["machine"]["threads"] for run in runs),
+                number(comparison.minutes(agent)),
+                number(float(np.mean([run["steps_per_second"] for run in runs]))),
+                str(sum(bool(run["resumed_at"]) or run["attempts"] > 1 for run in runs)),
+            ]
+        )
+    header = ["agent", "seeds", "device", "threads", "minutes per run", "steps/s", "restarted runs"]
+    found = [("Runs", _html(make_table(header, rows)))]
+    for heading, path in (
+        ("Hyperparameters", ("entry", "hyperparameters")),
+        ("Protocol", ("protocol",)),
+        ("Versions", ("versions",)),
+    ):
+        found.append((heading, _html(_side_by_side(comparison, path), "words")))
+    return found
+
+
+def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
+    """
+    :param path: of the settings in a result
+    :return: a row per setting, a column per agent; the values of different runs beside each other
+    """
+
+    def of(run: dict[str, Any]) -> dict[str, str]:
+        for key in path:
+            run = run[key]
+        return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flatten(run).items()}
+
+    by_agent = {comparison.label(agent): [of(run) for run in comparison.runs(agent)] for agent in comparison.agents}
+    keys = dict.fromkeys(key for runs in by_agent.values() for run in runs for key in run)
+    rows = [
+        [key, *(" / ".join(dict.fromkeys(run.get(key, "–") for run in runs)) for runs in by_agent.values())] for key in keys
+    ]
+    if len(by_agent) > 1 and all(len(set(row[1:])) == 1 for row in rows):
+        return make_table(["setting", "all agents"], [row[:2] for row in rows])
+    return make_table(["setting", *by_agent], rows)
+
+
+def _commands(comparison: Comparison, command: str) -> list[str]:
+    """What repeats runs and report."""
+    commands = dict.fromkeys(result["command"] for result in comparison.results)
+    whole = [text for text in commands if "--suite" in text] or list(commands)  # not those that only resumed
+    return [*whole, command]

@@ -1,46 +1,105 @@
 """Suites: the games, steps, preprocessing, evaluation protocol and normalisation of a benchmark."""
 
-import dataclasses
 import pathlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import yaml
+from annotated_types import Len
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError, field_validator, model_validator
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
-from sb3_eqr.common.arguments import number
 from sb3_eqr.common.files import atomic_write
-from sb3_eqr.common.validation import check_number
 from sb3_eqr.zoo.checks import nearest
 
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
-EVALUATION = {"episodes", "n_envs", "epsilon", "max_steps", "preprocessing", "curve"}
-CURVE = {"points", "episodes"}
-NORMALISATION = {"unit", "source", "scores"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Suite:
+class Strict(BaseModel):
+    """Keys and values exactly as written here: an unknown key is a mistake, and so is a flag where a number is needed."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class Curve(Strict):
+    """A learning curve has ``points`` points of ``episodes`` episodes each; the last one is the final evaluation."""
+
+    points: PositiveInt
+    episodes: PositiveInt
+
+
+class Evaluation(Strict):
+    """How agents are evaluated: ``episodes`` in ``n_envs`` environments, of at most ``max_steps`` steps (``None``: any)."""
+
+    episodes: PositiveInt
+    n_envs: PositiveInt
+    curve: Curve
+    epsilon: float = Field(0.0, ge=0, le=1)
+    max_steps: PositiveInt | None = None
+    preprocessing: dict[str, Any]
+
+
+class Normalisation(Strict):
+    """Which raw scores become 0 and 1, per game, and what they are."""
+
+    unit: str
+    source: str
+    scores: dict[str, Annotated[list[FiniteFloat], Len(2, 2)]]
+
+    @field_validator("scores")
+    @classmethod
+    def _rise(cls, scores: dict[str, list[float]]) -> dict[str, list[float]]:
+        for game, (low, high) in scores.items():
+            if low >= high:
+                raise ValueError(f"{game}: the score that becomes 1 must be above the one that becomes 0")
+        return scores
+
+
+class Suite(Strict):
     """
     :param name: of the suite
     :param games: names as users write them
     :param env_id: gymnasium's name of a game's environment, "{game}" standing for the game
-    :param steps: training steps of the agent, per game
+    :param steps: training steps of the agent, per game; in a file also one number for all
     :param preprocessing: keys of RL Zoo's entries (``env_wrapper``, ``frame_stack``, ...) that stand before an agent's own
-    :param evaluation: episodes, n_envs, epsilon, max_steps (``None``: no limit), preprocessing (of evaluation), curve:
-        {points, episodes}: the learning curve has ``points`` points of ``episodes`` episodes, the last being the final one
-    :param normalisation: unit, source, scores: game -> [score that is 0, score that is 1]
+    :param evaluation: its preprocessing is that of training where it has none
+    :param normalisation: "human" in a file: random play 0, a human tester 1; raw scores where there is none
     """
 
     name: str
-    games: list[str]
+    games: Annotated[list[str], Len(1)]
     env_id: str
-    steps: dict[str, int]
-    preprocessing: dict[str, Any]
-    evaluation: dict[str, Any]
-    normalisation: dict[str, Any]
+    steps: dict[str, PositiveInt]
+    preprocessing: dict[str, Any] = {}
+    evaluation: Evaluation
+    normalisation: Normalisation
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, entry: Any) -> Any:
+        """What a file may leave out."""
+        if not isinstance(entry, dict) or not isinstance(entry.get("games"), list):
+            return entry  # pydantic says what is wrong
+        games = [game for game in entry["games"] if isinstance(game, str)]
+        found = {"normalisation": {"unit": "raw score", "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
+        if found["normalisation"] == "human":
+            found["normalisation"] = human_scores(games)
+        if "steps" in found and not isinstance(found["steps"], dict):
+            found["steps"] = dict.fromkeys(games, found["steps"])
+        if isinstance(found.get("evaluation"), dict):
+            found["evaluation"] = {"preprocessing": found.get("preprocessing", {})} | found["evaluation"]
+        return found
+
+    @model_validator(mode="after")
+    def _covers_games(self) -> "Suite":
+        if "{game}" not in self.env_id and len(self.games) > 1:
+            raise ValueError(f"env_id: expected {{game}} in it, found {self.env_id!r}")
+        for what, there in (("steps", self.steps), ("normalisation: scores", self.normalisation.scores)):
+            if missing := [game for game in self.games if game not in there]:
+                raise ValueError(f"{what}: expected them for every game, found none for {', '.join(missing)}")
+        return self
 
     def protocol(self, game: str) -> dict[str, Any]:
         """
@@ -50,7 +109,7 @@ class Suite:
             "env_id": self.env_id.format(game=game),
             "steps": self.steps[game],
             "preprocessing": self.preprocessing,
-            "evaluation": self.evaluation,
+            "evaluation": self.evaluation.model_dump(),
         }
 
 
@@ -62,45 +121,13 @@ def nearest_name(name: str, legal: Iterable[str]) -> str:
     return f"{nearest(name, names)} There are {', '.join(names)}."
 
 
-def check_keys(where: str, found: Iterable[str], legal: set[str], needed: set[str]) -> None:
-    """
-    :raises ValueError: for a key that there is not, or one that is missing
-    """
-    for key in found:
-        if key not in legal:
-            raise ValueError(f"{where}: unknown key {key!r}.{nearest_name(key, legal)}")
-    if missing := needed - set(found):
-        raise ValueError(f"{where}: expected the keys {', '.join(sorted(needed))}, found no {', '.join(sorted(missing))}")
-
-
-def check_mapping(where: str, value: Any) -> dict[str, Any]:
-    """
-    :raises ValueError: if it is no mapping
-    """
-    if not isinstance(value, dict):
-        raise ValueError(f"{where}: expected keys and values, found {value!r}")
-    return value
-
-
-def check_scores(where: str, scores: Any) -> None:
-    """
-    :raises ValueError: for anything but two finite numbers, the second above the first: what becomes 0 and what becomes 1
-    """
-    is_pair = isinstance(scores, (list, tuple)) and len(scores) == 2
-    if not (is_pair and all(map(number().holds, scores)) and scores[0] < scores[1]):
-        raise ValueError(f"{where}: expected the scores that become 0 and 1, the second above the first, found {scores!r}")
-
-
 def human_scores(games: list[str]) -> dict[str, Any]:
     """
     :return: the normalisation of Atari 100K: random play 0, a human tester 1
     """
     table = load_reference().pivot(index="game", columns="method", values="mean")
-    scores = {}
-    for game in games:
-        row = table.index[table.index == game.lower()]
-        if len(row):
-            scores[game] = [float(table.at[row[0], RANDOM]), float(table.at[row[0], HUMAN])]
+    known = {game: table.loc[game.lower()] for game in games if game.lower() in table.index}
+    scores = {game: [float(row[RANDOM]), float(row[HUMAN])] for game, row in known.items()}
     return {"unit": "human-normalised score", "source": "EqR paper, Table 2", "scores": scores}
 
 
@@ -112,47 +139,28 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     :raises ValueError: for an entry that is not complete, with what is wrong
     """
     where = f"{where}, suite {name!r}"
-    check_mapping(where, entry)
-    needed = {"env_id", "games", "steps", "evaluation"}
-    check_keys(where, entry, needed | {"preprocessing", "normalisation"}, needed)
-    if not isinstance(entry["games"], list) or not entry["games"]:
-        raise ValueError(f"{where}: games: expected a list, found {entry['games']!r}")
-    if "{game}" not in str(entry["env_id"]) and len(entry["games"]) > 1:
-        raise ValueError(f"{where}: env_id: expected {{game}} in it, found {entry['env_id']!r}")
-    games = [str(game) for game in entry["games"]]
-    steps = entry["steps"] if isinstance(entry["steps"], dict) else dict.fromkeys(games, entry["steps"])
-    if missing := [game for game in games if game not in steps]:
-        raise ValueError(f"{where}: expected steps for every game, found none for {', '.join(missing)}")
-    if wrong := [game for game in games if not (isinstance(steps[game], int) and steps[game] > 0)]:
-        raise ValueError(f"{where}: steps: expected whole numbers above 0, found {steps[wrong[0]]!r} for {wrong[0]}")
-    evaluation = {"max_steps": None, "preprocessing": entry.get("preprocessing", {}), "epsilon": 0.0}
-    evaluation |= check_mapping(f"{where}: evaluation", entry["evaluation"])
-    check_keys(f"{where}: evaluation", evaluation, EVALUATION, EVALUATION)
-    check_keys(f"{where}: evaluation: curve", check_mapping(f"{where}: curve", evaluation["curve"]), CURVE, CURVE)
-    for key in ("episodes", "n_envs"):
-        check_number(f"{where}: evaluation: {key}", evaluation[key], 1, whole=True)
-    for key in CURVE:
-        check_number(f"{where}: evaluation: curve: {key}", evaluation["curve"][key], 1, whole=True)
-    check_number(f"{where}: evaluation: epsilon", evaluation["epsilon"], 0, 1)
-    normalisation = entry.get("normalisation", {"unit": "raw score", "source": "none", "scores": {g: [0, 1] for g in games}})
-    if normalisation == "human":
-        normalisation = human_scores(games)
-    check_keys(
-        f"{where}: normalisation", check_mapping(f"{where}: normalisation", normalisation), NORMALISATION, NORMALISATION
-    )
-    if missing := [game for game in games if game not in normalisation["scores"]]:
-        raise ValueError(f"{where}: normalisation: expected two scores for every game, found none for {', '.join(missing)}")
-    for game in games:
-        check_scores(f"{where}: normalisation: {game}", normalisation["scores"][game])
-    return Suite(
-        name,
-        games,
-        entry["env_id"],
-        {game: steps[game] for game in games},
-        entry.get("preprocessing", {}),
-        evaluation,
-        normalisation,
-    )
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected keys and values, found {entry!r}")
+    try:
+        return Suite.model_validate({"name": name} | entry)
+    except ValidationError as error:
+        raise ValueError(f"{where}: {_first_mistake(error)}") from error
+
+
+def _first_mistake(error: ValidationError) -> str:
+    """In words: where it is, what was expected, what was found."""
+    mistake = error.errors(include_url=False)[0]
+    *outer, key = mistake["loc"] or ("",)
+    path = ": ".join(map(str, mistake["loc"]))
+    if mistake["type"] == "extra_forbidden":
+        kinds: dict[str, type[Strict]] = {"evaluation": Evaluation, "curve": Curve, "normalisation": Normalisation}
+        kind = kinds.get(str(outer[-1]), Suite) if outer else Suite
+        return f"unknown key {path!r}.{nearest_name(str(key), kind.model_fields)}"
+    if mistake["type"] == "missing":
+        return f"expected the key {path!r}, found none"
+    if mistake["type"] == "value_error":
+        return f"{path}: {mistake['ctx']['error']}" if path else str(mistake["ctx"]["error"])
+    return f"{path}: {mistake['msg'][0].lower()}{mistake['msg'][1:]}, found {mistake['input']!r}"
 
 
 def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
@@ -188,33 +196,31 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
     :raises ValueError: for a game that the suite has not, with the nearest name, or that gymnasium has not
     """
     envs.register()
+    kept = suite.games
     if games is not None:
-        by_name = {game.lower(): game for game in suite.games}
         for game in games:
-            if game.lower() not in by_name:
+            if game.lower() not in map(str.lower, suite.games):
                 raise ValueError(f"--games: suite {suite.name!r} has no game {game!r}.{nearest_name(game, suite.games)}")
-        kept = {game.lower() for game in games}
-        suite = dataclasses.replace(suite, games=[game for game in suite.games if game.lower() in kept])
-    if steps is not None:
-        suite = dataclasses.replace(suite, steps=dict.fromkeys(suite.games, steps))
-    for game in suite.games:
+        kept = [game for game in suite.games if game.lower() in map(str.lower, games)]
+    per_game = suite.steps if steps is None else dict.fromkeys(kept, steps)
+    for game in kept:
         env_id = suite.env_id.format(game=game)
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
                 f'{nearest(env_id, gym.registry)} For Atari: pip install "sb3-eqr[atari]".'
             )
-    return suite
+    return suite.model_copy(update={"games": kept, "steps": per_game})
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:
     """Write a suite whole, with everything that it leaves to its defaults."""
     with atomic_write(path, "yml") as file:
-        file.write(yaml.safe_dump(dataclasses.asdict(suite), sort_keys=False).encode())
+        file.write(yaml.safe_dump(suite.model_dump(), sort_keys=False).encode())
 
 
 def read_suite(path: pathlib.Path) -> Suite:
     """
     :param path: of :func:`write_suite`
     """
-    return Suite(**yaml.safe_load(path.read_text(encoding="utf-8")))
+    return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))

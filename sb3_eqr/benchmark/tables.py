@@ -1,68 +1,70 @@
-"""Tables of a report, once as rows of cells, then as HTML, Markdown and LaTeX."""
+"""Tables of a report: texts in a pandas frame, whose first column names the rows, and which of them are bold."""
 
-import dataclasses
 import html
-import re
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import HUMAN, PUBLISHED_STEPS, RANDOM, PublishedMethod, published_means
-from sb3_eqr.benchmark.statistics import METRICS, games_above
+from sb3_eqr.benchmark.reference import HUMAN, RANDOM
+from sb3_eqr.benchmark.statistics import METRICS, detectable_difference, games_above, iqm
 
-MARK = "‡"  # at the name of an agent with another protocol
-LONG = 40  # letters; longer texts in a cell may be broken
-LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    "±": r"$\pm$",
-    "−": "$-$",
-    "–": "--",
-    "†": r"\dag{}",
-    "κ": r"$\kappa$",
-    MARK: r"\ddag{}",
-}
+LATEX = {"±": r"$\pm$", "−": "$-$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}"}  # what pandas leaves as it is
 
 
-@dataclasses.dataclass(frozen=True)
-class Cell:
+class Table(NamedTuple):
     """
-    :param text: what stands in it
-    :param bold: the best of its row
-    :param aside: a smaller addition, a spread or an interval
+    :param cells: texts; what follows a line break is an addition, a spread or an interval
+    :param bold: as large
     """
 
-    text: str
-    bold: bool = False
-    aside: str = ""
+    cells: pd.DataFrame
+    bold: pd.DataFrame
+
+    def emphasised(self, before: str, after: str) -> pd.DataFrame:
+        """:return: the cells, with something around the first line of those that are bold"""
+        return self.cells.mask(self.bold, self.cells.replace(r"^([^\n]+)", rf"{before}\1{after}", regex=True))
 
 
-@dataclasses.dataclass(frozen=True)
-class Table:
+def make_table(header: Sequence[str], rows: Sequence[Sequence[str]], bold: Sequence[Sequence[bool]] | None = None) -> Table:
     """
-    :param header: of the columns
-    :param rows: as long as the header; the first cell names the row
-    :param ruled: numbers of the rows that a line stands above
-    :param align: of all columns but the first: "right" for numbers, "left" for words
+    :param rows: as long as the header
+    :param bold: as many; none of them where not given
     """
+    cells = pd.DataFrame(rows, columns=list(header), dtype=str)
+    is_bold = np.zeros(cells.shape, dtype=bool) if bold is None else np.array(bold, dtype=bool).reshape(cells.shape)
+    return Table(cells, pd.DataFrame(is_bold, columns=cells.columns))
 
-    header: list[str]
-    rows: list[list[Cell]]
-    ruled: tuple[int, ...] = ()
-    align: str = "right"
+
+def to_html(table: Table, kind: str = "numbers") -> str:
+    """
+    :param kind: "numbers" or "words": how the columns are aligned
+    :return: a table in a box of its own that scrolls sideways
+    """
+    escaped = Table(table.cells.map(html.escape).rename(columns=html.escape), table.bold.rename(columns=html.escape))
+    cells = escaped.emphasised("<b>", "</b>").replace(r"\n(.*)", r"<br><small>\1</small>", regex=True)
+    content = cells.to_html(index=False, escape=False, border=0, classes=kind)
+    return f'<div class="box" tabindex="0">{content}</div>'
+
+
+def to_markdown(table: Table) -> str:
+    """:return: a table of GitHub's Markdown"""
+    cells = table.emphasised("**", "**").replace(r"\n", " ", regex=True).replace(r"\|", r"\\|", regex=True)
+    align = ("left", *["right"] * (len(cells.columns) - 1))
+    return cells.to_markdown(index=False, disable_numparse=True, colalign=align) + "\n"
+
+
+def to_latex(table: Table) -> str:
+    """:return: a ``tabular`` with the rules of the package booktabs"""
+    cells = table.cells.replace(r"\n", " ", regex=True)
+    style = cells.style.format(escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
+    style = style.apply(lambda _: table.bold.replace({True: "font-weight: bold", False: ""}), axis=None)
+    text = style.to_latex(hrules=True, convert_css=True, column_format="l" + "r" * (len(cells.columns) - 1))
+    for sign, command in LATEX.items():
+        text = text.replace(sign, command)
+    return "% Needs \\usepackage{booktabs}.\n" + text
 
 
 def number(value: float, decimals: int | None = None) -> str:
@@ -73,108 +75,39 @@ def number(value: float, decimals: int | None = None) -> str:
     """
     if np.isnan(value):
         return "–"
-    places = decimals_of(value) if decimals is None else decimals
-    text = f"{abs(value):,.{places}f}"
+    text = f"{abs(value):,.{decimals_of(value) if decimals is None else decimals}f}"
     return text if value >= 0 or float(text.replace(",", "")) == 0 else f"−{text}"
 
 
 def decimals_of(value: float) -> int:
-    """
-    :return: decimals that give about three significant digits: 0 from 100 on, 1 from 10 on, 2 below
-    """
+    """:return: decimals that give about three significant digits: 0 from 100 on, 1 from 10 on, 2 below"""
     return 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
 
 
-def interval(low: float, high: float) -> str:
+def with_interval(value: float, low: float, high: float) -> str:
+    """:return: "0.230", and below it "[0.120, 0.340]" where there is an interval"""
+    return number(value, 3) + ("" if np.isnan(low) else f"\n[{number(low, 3)}, {number(high, 3)}]")
+
+
+def distinct_best(matrices: Mapping[str, np.ndarray], differing: Mapping[str, str], reps: int) -> list[bool]:
     """
-    :return: "[0.120, 0.340]", "" where there is none
+    :param matrices: agent -> (runs, games), normalised scores
+    :param differing: agents that do not count: their protocol is another one
+    :return: of each agent whether it is the best, and these runs distinguish it from all others
     """
-    return "" if np.isnan(low) else f"[{number(low, 3)}, {number(high, 3)}]"
-
-
-def to_html(table: Table) -> str:
-    """
-    :return: a table in a box of its own that scrolls sideways
-    """
-    lines = [f'<div class="box" tabindex="0"><table class="{table.align}">', "<thead><tr>"]
-    lines += [f'<th scope="col">{_breakable(text)}</th>' for text in table.header]
-    lines.append("</tr></thead><tbody>")
-    for place, row in enumerate(table.rows):
-        lines.append('<tr class="ruled">' if place in table.ruled else "<tr>")
-        lines.append(f'<th scope="row">{_breakable(row[0].text)}</th>')
-        for cell in row[1:]:
-            text = f"<b>{html.escape(cell.text)}</b>" if cell.bold else html.escape(cell.text)
-            aside = f" <small>{html.escape(cell.aside)}</small>" if cell.aside else ""
-            kind = ' class="long"' if len(cell.text) > LONG else ""
-            lines.append(f"<td{kind}>{text}{aside}</td>")
-        lines.append("</tr>")
-    return "\n".join([*lines, "</tbody></table></div>"])
-
-
-def _breakable(text: str) -> str:
-    """:return: HTML in which the parts of an agent's name may stand on lines of their own, and a mark stays at its word"""
-    return re.sub("([:.])", r"\1<wbr>", re.sub(" ([†‡])", "\N{NO-BREAK SPACE}\\1", html.escape(text)))
-
-
-def to_markdown(table: Table) -> str:
-    """
-    :return: a table of GitHub's Markdown
-    """
-
-    def escaped(text: str) -> str:
-        return text.replace("\\", "\\\\").replace("|", "\\|").replace("_", "\\_").replace("*", "\\*").replace("<", "&lt;")
-
-    def shown(cell: Cell) -> str:
-        text = f"**{escaped(cell.text)}**" if cell.bold else escaped(cell.text)
-        return f"{text} {escaped(cell.aside)}".rstrip()
-
-    lines = [" | ".join(map(escaped, table.header)), "---|" + "|".join(["---:"] * (len(table.header) - 1))]
-    lines += [" | ".join(map(shown, row)) for row in table.rows]
-    return "\n".join(f"| {line} |" if "---" not in line else f"|{line}|" for line in lines) + "\n"
-
-
-def to_latex(table: Table) -> str:
-    """
-    :return: a ``tabular`` that needs no package
-    """
-
-    def escaped(text: str) -> str:
-        return re.sub("|".join(map(re.escape, LATEX)), lambda found: LATEX[found[0]], text)
-
-    def shown(cell: Cell) -> str:
-        text = rf"\textbf{{{escaped(cell.text)}}}" if cell.bold else escaped(cell.text)
-        return f"{text} {{\\scriptsize {escaped(cell.aside)}}}" if cell.aside else text
-
-    lines = [
-        "% Needs no package. Bold: the best of the runs of this benchmark and of those read from a file.",
-        rf"\begin{{tabular}}{{l{table.align[0] * (len(table.header) - 1)}}}",
-        r"\hline",
-        " & ".join(map(escaped, table.header)) + r" \\",
-        r"\hline",
-    ]
-    for place, row in enumerate(table.rows):
-        lines += [r"\hline"] if place in table.ruled else []
-        lines.append(" & ".join(map(shown, row)) + r" \\")
-    return "\n".join([*lines, r"\hline", r"\end{tabular}"]) + "\n"
-
-
-def label(comparison: Comparison, agent: str) -> str:
-    """
-    :return: the agent's name, marked where its protocol is not that of the others
-    """
-    return f"{agent} {MARK}" if agent in comparison.differing else agent
-
-
-def superhuman(comparison: Comparison) -> str:
-    """
-    :return: what a normalised score above 1 is called
-    """
-    return "superhuman games" if comparison.human else "games above 1"
+    values = {agent: float(iqm(matrix)) for agent, matrix in matrices.items() if agent not in differing}
+    best = max(values, key=lambda agent: values[agent], default="")
+    is_distinct = len(values) > 1 and all(
+        values[best] - value > detectable_difference(matrices[best], matrices[agent], reps)  # NaN: no
+        for agent, value in values.items()
+        if agent != best
+    )
+    return [is_distinct and agent == best for agent in matrices]
 
 
 def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
     """
-    Aggregates of methods of which only the means of games are known: what rliable gives for a single run of such scores.
+    Aggregates of methods of which only the means of games are known: those of a single run with these scores.
 
     :param means: rows games, columns methods, raw
     :return: columns label, metric, value; the metrics of ``METRICS`` and "above 1"
@@ -182,95 +115,70 @@ def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame
     rows = []
     for method in means:
         values = np.array([[comparison.normalize(game, means.at[game, method]) for game in means.index]])  # (1, games)
-        rows += [{"label": method, "metric": name, "value": function(values)} for name, function in METRICS.items()]
-        rows.append({"label": method, "metric": "above 1", "value": games_above(values)})
+        rows += [(method, name, float(function(values))) for name, function in METRICS.items()]
+        rows.append((method, "above 1", games_above(values)))
     return pd.DataFrame(rows, columns=["label", "metric", "value"])
 
 
-def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.DataFrame:
+def aggregate_rows(
+    comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray]
+) -> dict[str, list[str]]:
     """
-    :return: rows games, columns methods, raw mean scores; without columns where a run has other steps than theirs, the suite
-        is not normalised by human scores, or a compared game has no published score
+    :param aggregates: columns agent, metric, value, low, high
+    :param matrices: agent -> (runs, games), normalised scores
+    :return: name of the row -> a text per agent
     """
-    none = pd.DataFrame(index=comparison.games)
-    if not comparison.human or comparison.steps != {PUBLISHED_STEPS}:
-        return none
-    means = published_means(methods, comparison.games)
-    return means if len(means) == len(comparison.games) else none
+    by_agent = aggregates.set_index(["agent", "metric"])
+    rows = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in METRICS}
+    rows[comparison.above_one] = [str(games_above(matrix)) for matrix in matrices.values()]
+    rows["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
+    return rows
 
 
-def best(values: Mapping[str, float], comparison: Comparison) -> set[str]:
-    """
-    :param values: agent -> the higher the better
-    :return: the agents to print in bold: none where all are alike, and none whose protocol is not that of the others
-    """
-    if len(set(values.values())) < 2:
-        return set()
-    top = max(values.values())
-    return {agent for agent, value in values.items() if value == top and agent not in comparison.differing}
+def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], reps: int) -> Table:
+    """The aggregates of the runs compared, a row per agent; parameters as those of :func:`aggregate_rows`."""
+    columns = aggregate_rows(comparison, aggregates, matrices)
+    rows = [
+        [comparison.label(agent), str(len(matrix)), *(texts[place] for texts in columns.values())]
+        for place, (agent, matrix) in enumerate(matrices.items())
+    ]
+    best = distinct_best(matrices, comparison.differing, reps)
+    bold = [[column == 2 and is_best for column in range(len(rows[0]))] for is_best in best]
+    return make_table(["agent", "runs", *columns], rows, bold)
 
 
 def game_table(
-    comparison: Comparison, aggregates: pd.DataFrame, matrices: dict[str, np.ndarray], means: pd.DataFrame
+    comparison: Comparison,
+    aggregates: pd.DataFrame,
+    matrices: Mapping[str, np.ndarray],
+    means: pd.DataFrame,
+    reps: int,
 ) -> Table:
     """
     Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised ones below.
 
-    :param aggregates: columns agent, metric, value, low, high
-    :param matrices: agent -> (runs, games), normalised scores
-    :param means: of :func:`published`
+    :param means: of :func:`~sb3_eqr.benchmark.analysis.published`; the others are those of :func:`aggregate_rows`
     """
-    agents = list(matrices)
     names = (RANDOM, HUMAN) if comparison.human else ("score 0", "score 1")
-    header = ["game", *names, *(label(comparison, agent) for agent in agents), *(f"{name} †" for name in means)]
+    header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
     by_game = comparison.scores.groupby(["agent", "game"])["raw"].agg(["mean", "std"])
-    rows = []
+    rows, bold = [], []
     for game in comparison.games:
-        row = [Cell(game), *(Cell(number(bound)) for bound in comparison.bounds[game])]
-        low, high = comparison.bounds[game]
-        bold = best({agent: by_game.at[(agent, game), "mean"] * np.sign(high - low) for agent in agents}, comparison)
-        for agent in agents:
-            mean, spread = by_game.loc[(agent, game)]
-            aside = "" if np.isnan(spread) else f"± {number(spread, decimals_of(mean))}"
-            row.append(Cell(number(mean), bold=agent in bold, aside=aside))
-        rows.append(row + [Cell(number(means.at[game, method])) for method in means])
-    return Table(header, rows + _aggregate_rows(comparison, aggregates, matrices, means), ruled=(len(rows),))
-
-
-def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: dict[str, np.ndarray]) -> Table:
-    """
-    The aggregates of the runs compared, a row per agent.
-
-    :param aggregates: columns agent, metric, value, low, high
-    :param matrices: agent -> (runs, games), normalised scores
-    """
-    columns = _aggregate_rows(comparison, aggregates, matrices, pd.DataFrame(index=comparison.games))
-    header = ["agent", "runs", *(column[0].text for column in columns)]
-    rows = [
-        [Cell(label(comparison, agent)), Cell(str(len(matrix))), *(column[3 + place] for column in columns)]
-        for place, (agent, matrix) in enumerate(matrices.items())
-    ]
-    return Table(header, rows)
-
-
-def _aggregate_rows(
-    comparison: Comparison, aggregates: pd.DataFrame, matrices: dict[str, np.ndarray], means: pd.DataFrame
-) -> list[list[Cell]]:
-    by_agent = aggregates.set_index(["agent", "metric"])
+        place = sorted(comparison.games).index(game)  # of its column
+        found = [by_game.loc[(agent, game)] for agent in matrices]
+        texts = [
+            number(mean) + ("" if np.isnan(spread) else f"\n± {number(spread, decimals_of(mean))}") for mean, spread in found
+        ]
+        bounds = [number(bound) for bound in comparison.bounds[game]]
+        rows.append([game, *bounds, *texts, *(number(means.at[game, method]) for method in means)])
+        of_game = {agent: matrix[:, [place]] for agent, matrix in matrices.items()}
+        bold.append([False] * 3 + distinct_best(of_game, comparison.differing, reps) + [False] * len(means.columns))
     of_means = aggregate_means(means, comparison).set_index(["label", "metric"])["value"]
-    rows = []
-    for metric in METRICS:
-        bounds = (1.0, 0.0) if metric == "optimality gap" else (0.0, 1.0)
-        values = {agent: by_agent.at[(agent, metric), "value"] for agent in matrices}
-        bold = best({a: -value if metric == "optimality gap" else value for a, value in values.items()}, comparison)
-        row = [Cell(metric), *(Cell(number(bound, 3)) for bound in bounds)]
-        for agent, value in values.items():
-            ends = interval(*by_agent.loc[(agent, metric), ["low", "high"]])
-            row.append(Cell(number(value, 3), bold=agent in bold, aside=ends))
-        rows.append(row + [Cell(number(of_means[method, metric], 3)) for method in means])
-    counts = {agent: games_above(matrix) for agent, matrix in matrices.items()}
-    row = [Cell(superhuman(comparison)), Cell("0"), Cell("–")]  # nothing is above itself
-    bold = best(counts, comparison)
-    row += [Cell(str(n), bold=agent in bold) for agent, n in counts.items()]
-    row += [Cell(str(int(of_means[method, "above 1"]))) for method in means]
-    return [*rows, row]
+    for name, texts in aggregate_rows(comparison, aggregates, matrices).items():
+        ends = ("1", "0") if name == "optimality gap" else ("0", "1") if name in METRICS else ("", "")
+        metric = "above 1" if name == comparison.above_one else name
+        known = [of_means.get((method, metric), np.nan) for method in means]
+        rows.append([name, *ends, *texts, *(number(value, 3 if name in METRICS else 0) for value in known)])
+        is_best = distinct_best(matrices, comparison.differing, reps) if name == "IQM" else [False] * len(matrices)
+        bold.append([False] * 3 + is_best + [False] * len(means.columns))
+    return make_table(header, rows, bold)

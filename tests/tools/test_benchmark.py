@@ -233,15 +233,19 @@ def test_the_script_without_its_extra(monkeypatch):
     "change, message",
     [
         ({"step": 1}, "unknown key 'step'. Did you mean 'steps'"),
-        ({"steps": {"CartPole": 10}}, "expected steps for every game, found none for Acrobot"),
-        ({"steps": 0}, "expected whole numbers above 0, found 0"),
-        ({"evaluation": {"episodes": 1, "n_envs": 1}}, "found no curve"),
-        ({"normalisation": {"unit": "x"}}, "found no scores, source"),
-        ({"games": "CartPole"}, "games: expected a list, found 'CartPole'"),
+        ({"steps": {"CartPole": 10}}, "steps: expected them for every game, found none for Acrobot"),
+        ({"steps": 0}, "steps: CartPole: input should be greater than 0, found 0"),
+        ({"evaluation": {"episodes": 1, "n_envs": 1}}, "expected the key 'evaluation: curve', found none"),
+        ({"evaluation": {**SUITE["evaluation"], "epsilom": 0}}, "unknown key 'evaluation: epsilom'. Did you mean 'epsilon'"),
+        ({"normalisation": {"unit": "x"}}, "expected the key 'normalisation: source', found none"),
+        ({"games": "CartPole"}, "games: input should be a valid list, found 'CartPole'"),
         ({"env_id": "CartPole-v1"}, "expected {game} in it, found 'CartPole-v1'"),
-        ({"evaluation": None}, "evaluation: expected keys and values, found None"),
-        ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "n_envs must be an integer >= 1, got 0"),
-        ({"evaluation": {**SUITE["evaluation"], "epsilon": 7}}, r"epsilon must be a finite number in \[0, 1\], got 7"),
+        ({"evaluation": None}, "evaluation: input should be a valid dictionary or i.*, found None"),
+        ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "evaluation: n_envs: input should be greater than 0, found 0"),
+        (
+            {"evaluation": {**SUITE["evaluation"], "epsilon": 7}},
+            "evaluation: epsilon: input should be less than or equal to 1, found 7",
+        ),
         ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "found none for CartPole, Acrobot"),
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
@@ -309,16 +313,16 @@ def test_our_suites(tmp_path):
     atari = load_suite("atari100k")
     reference = benchmark.load_reference()
     assert {game.lower() for game in atari.games} == set(reference["game"]) and set(atari.steps.values()) == {100_000}
-    assert atari.normalisation["scores"]["Pong"] == [-20.7, 14.6]  # the paper's Table 2
+    assert atari.normalisation.scores["Pong"] == [-20.7, 14.6]  # the paper's Table 2
     assert load_suite("atari100k-5").games == ["Assault", "BattleZone", "Boxing", "ChopperCommand", "Qbert"]
     for name in ("atari100k", "atari100k-5", "minatar", "classic", "smoke"):
         suite = choose(load_suite(name), None, None)
-        assert suite.normalisation["scores"].keys() == set(suite.games), name
-        assert all(high > low for low, high in suite.normalisation["scores"].values())
+        assert suite.normalisation.scores.keys() == set(suite.games), name
+        assert all(high > low for low, high in suite.normalisation.scores.values())
         write_suite(suite, tmp_path / "suite.yml")
         assert read_suite(tmp_path / "suite.yml") == suite
     evaluation = atari.evaluation
-    assert (evaluation["episodes"], evaluation["epsilon"], evaluation["max_steps"]) == (100, 0.001, 27_000)
+    assert (evaluation.episodes, evaluation.epsilon, evaluation.max_steps) == (100, 0.001, 27_000)
 
 
 def test_agents_and_their_files():

@@ -4,15 +4,8 @@ import json
 
 import pytest
 
-from sb3_eqr.benchmark.reference import (
-    disagreements,
-    human_normalized,
-    last_rows,
-    load_reference,
-    match_games,
-    published_table,
-    read_runs,
-)
+from benchmarks.published_rows import disagreements, last_rows, published_table
+from sb3_eqr.benchmark.reference import human_normalized, load_reference, match_games, read_runs
 from tests.tools.test_package import ROOT
 
 # mean, median, games above human, as printed under Tables 2, 3 and 4

@@ -1,0 +1,94 @@
+"""
+The last rows of the EqR paper's tables, computed from the scores that the package brings: docs/results/published.md.
+
+    python -m benchmarks.published_rows
+"""
+
+import pandas as pd
+
+from sb3_eqr.benchmark.reference import human_normalized, load_reference
+
+# mean, median, games above human, as printed under Tables 2, 3 and 4 of the EqR paper
+PRINTED = {
+    "SimPLe [EqR Tab2]": (0.443, 0.144, 2),
+    "DER [EqR Tab2]": (0.285, 0.161, 2),
+    "CURL [EqR Tab2]": (0.381, 0.175, 2),
+    "DrQ [EqR Tab2]": (0.357, 0.268, 2),
+    "SPR [EqR Tab2]": (0.704, 0.415, 7),
+    "EqR, L_R [EqR Tab2]": (0.859, 0.418, 8),
+    "EqR, L_R + L_{GET} [EqR Tab2]": (0.886, 0.398, 7),
+    "MLP [EqR Tab3]": (0.681, 0.398, 6),
+    "EqR, T_2 [EqR Tab3]": (0.829, 0.361, 6),
+    "EqR, SE_2 [EqR Tab3]": (0.859, 0.418, 8),
+    "EqR, GL_2 [EqR Tab3]": (0.833, 0.380, 7),
+    "EqR [EqR Tab4]": (0.682, 0.337, 6),
+    "EqR, L_R [EqR Tab4]": (0.859, 0.418, 8),
+    "EqR, L_{GET} [EqR Tab4]": (0.749, 0.377, 6),
+    "EqR, $L_R + L_{GET}$ [EqR Tab4]": (0.886, 0.398, 7),
+}
+
+
+def last_rows() -> pd.DataFrame:
+    """
+    What the EqR paper prints under Tables 2, 3 and 4, computed from the scores in the tables.
+
+    :return: columns table (2, 3, 4), method, mean, median, superhuman (games above human), and the same three as printed:
+        printed_mean, printed_median, printed_superhuman; means and medians to the printed three decimals
+    """
+    normalized = human_normalized(load_reference())
+    rows = []
+    for method, (mean, median, superhuman) in PRINTED.items():
+        values = normalized[method]
+        rows.append(
+            {
+                "table": int(method[-2]),
+                "method": method.partition(" [")[0].replace("$", ""),
+                "mean": round(float(values.mean()), 3),
+                "median": round(float(values.median()), 3),
+                "superhuman": int((values > 1).sum()),
+                "printed_mean": mean,
+                "printed_median": median,
+                "printed_superhuman": superhuman,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def disagreements(rows: pd.DataFrame) -> list[str]:
+    """
+    :param rows: of :func:`last_rows`
+    :return: a sentence for each figure that the paper prints otherwise than its scores give
+    """
+    return [
+        f"{row['method']} in Table {row['table']}: the paper prints a {what} of {row[f'printed_{what}']:.3f}, "
+        f"the scores in its table give {row[what]:.3f}."
+        for row in rows.to_dict("records")
+        for what in ("mean", "median", "superhuman")
+        if row[what] != row[f"printed_{what}"]
+    ]
+
+
+def published_table() -> str:
+    """
+    :return: :func:`last_rows` as a Markdown page
+    """
+    rows = last_rows()
+    lines = [
+        "# The last rows of the EqR paper's tables",
+        "",
+        "Human-normalised scores on the 26 games of Atari 100K, computed from the game scores that the paper prints",
+        "(`python -m benchmarks.published_rows`). Superhuman games are those with a mean above 1.",
+        "",
+        "| table | method | mean | median | superhuman games |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['table']} | {row['method']} | {row['mean']:.3f} | {row['median']:.3f} | {row['superhuman']} |"
+        for row in rows.to_dict("records")
+    ]
+    lines += ["", "All agree with what is printed, but for these:", "", *(f"- {text}" for text in disagreements(rows))]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(published_table())
