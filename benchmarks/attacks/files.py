@@ -23,7 +23,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.attacks import Finding
 from benchmarks.attacks.inputs import make
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
-from sb3_eqr.benchmark.checkpoints import load_checkpoint
+from sb3_eqr.benchmark.training import load_checkpoint
 from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.visualize.loading import load_model, make_env
 

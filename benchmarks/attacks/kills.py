@@ -14,8 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.attacks import Finding
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
-from sb3_eqr.benchmark.plan import plan_runs
-from sb3_eqr.benchmark.run import RESULT, Run, Settings
+from sb3_eqr.benchmark.runs import RESULT, Run, Settings, plan_runs
 from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints

@@ -8,9 +8,8 @@ import sys
 import torch as th
 from rich.console import Console
 
-from sb3_eqr.benchmark.plan import plan_runs, read_plan, state_of, write_plan
-from sb3_eqr.benchmark.run import ERROR, Run, Settings
-from sb3_eqr.benchmark.runner import make_table, run_benchmark
+from sb3_eqr.benchmark.dispatch import make_table, run_benchmark
+from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, write_plan
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.zoo.checks import check_machine, fail
@@ -111,10 +110,11 @@ def run(args: argparse.Namespace) -> int:
     for note in never_learn([planned.description() for planned in runs]):
         print(f"Note: {note}")
     command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
-    settings = Settings(command, device, max(int(args.cpus_per_run), 1), args.checkpoint_every)
+    threads = max(int(args.cpus_per_run), 1)
+    settings = Settings(command=command, device=device, n_threads=threads, checkpoint_seconds=args.checkpoint_every)
     failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, Console())
     for lost in failed:
-        print(f"failed: {lost.agent.name}, {lost.game}, seed {lost.seed}: {lost.folder / ERROR}")
+        print(f"failed: {lost.label}: {lost.folder / ERROR}")
     if failed:
         print("The same command tries them again, from their last checkpoints.")
     else:
@@ -128,12 +128,12 @@ def status(args: argparse.Namespace) -> int:
     :return: exit status
     """
     runs = read_plan(args.folder)
-    states = [state_of(run) for run in runs]
+    states = [run.state() for run in runs]
     Console().print(make_table(runs, states))
     for run, state in zip(runs, states, strict=True):
         if state.name == "failed":
             reason = (run.folder / ERROR).read_text(encoding="utf-8").strip().splitlines()[-1]
-            print(f"failed: {run.agent.name}, {run.game}, seed {run.seed}: {reason}")
+            print(f"failed: {run.label}: {reason}")
     return 0
 
 

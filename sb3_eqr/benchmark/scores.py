@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_eqr.benchmark.run import RESULT
+from sb3_eqr.benchmark.runs import RESULT
 
 COLUMNS = ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
 

@@ -1,4 +1,4 @@
-"""Doing one run of a benchmark, from its beginning or last checkpoint to its scores."""
+"""Doing one run of a benchmark, from its beginning or last checkpoint to its scores, and what it measures on the way."""
 
 import argparse
 import contextlib
@@ -7,6 +7,7 @@ import importlib.metadata
 import os
 import pathlib
 import platform
+import shutil
 import tempfile
 import time
 import traceback
@@ -18,15 +19,20 @@ from filelock import FileLock, Timeout
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_eqr import envs
-from sb3_eqr.benchmark.checkpoints import find_checkpoints, load_checkpoint, remove_checkpoints, write_checkpoint
-from sb3_eqr.benchmark.recording import Clock, LossWriter, RunCallback, add_evaluation, new_record
-from sb3_eqr.benchmark.run import ERROR, LOCK, PROGRESS, RESULT, STARTS, Run, Settings, write_json
+from sb3_eqr.benchmark.evaluation import evaluate
+from sb3_eqr.benchmark.runs import ERROR, LOCK, PROGRESS, RESULT, STARTS, Run, Settings, write_json
+from sb3_eqr.common import checkpoints
+from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints, write_checkpoint
 from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.plain_data import decode
+from sb3_eqr.common.resets import Resets
 from sb3_eqr.zoo import register
 
+PROGRESS_SECONDS = 2.0  # between two notes of where a run is
 PACKAGES = (
     "sb3-eqr",
     "stable-baselines3",
@@ -39,6 +45,139 @@ PACKAGES = (
     "numpy",
     "ray",
 )
+
+
+def new_record() -> dict[str, Any]:
+    """What a run measures: "seconds" of everything, and "training_seconds" without evaluations and checkpoints."""
+    return {
+        "seconds": 0.0,
+        "training_seconds": 0.0,
+        "resumed_at": [],
+        "resumed_exactly": True,
+        "evaluations": [],
+        "training": {"step": [], "score": [], "length": []},
+        "losses": [],
+    }
+
+
+class LossWriter(KVWriter):
+    """
+    :param losses: a row is appended whenever SB3 dumps its log
+    """
+
+    def __init__(self, losses: list[dict[str, float]]):
+        self._losses = losses
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """As SB3's writers."""
+        row = {key[6:]: float(v) for key, v in key_values.items() if key.startswith("train/") and key.endswith("loss")}
+        if row:
+            self._losses.append({"step": step, **row})
+
+
+class Clock:
+    """
+    Adds the time since the last reading to what a record has.
+
+    :param record: of :func:`new_record`
+    """
+
+    def __init__(self, record: dict[str, Any]):
+        self._record = record
+        self._last = time.monotonic()
+
+    def read(self, what: str) -> None:
+        """
+        :param what: what the time was spent on: "training_seconds", or "seconds" for anything else
+        """
+        now = time.monotonic()
+        for key in {what, "seconds"}:
+            self._record[key] += now - self._last
+        self._last = now
+
+
+class RunCallback(BaseCallback):
+    """
+    Notes training scores and progress, evaluates along the way, writes checkpoints, stops after exactly the steps asked for.
+
+    :param run: the run
+    :param record: what was measured so far
+    :param settings: the settings
+    """
+
+    def __init__(self, run: Run, record: dict[str, Any], settings: Settings):
+        super().__init__()
+        self.run, self.record, self.settings = run, record, settings
+        self.steps = run.protocol["steps"]
+        curve = run.protocol["evaluation"]["curve"]
+        self.due = [self.steps * point // curve["points"] for point in range(1, curve["points"])]
+        self.curve_episodes = curve["episodes"]
+        self.clock = Clock(record)
+        self.noted = 0.0
+        self.saved = time.monotonic()
+
+    def _on_training_start(self) -> None:
+        self.first_step, self.first_second = self.num_timesteps, self.record["training_seconds"]
+        self.note_progress()
+
+    def _on_rollout_start(self) -> None:
+        if time.monotonic() - self.saved >= self.settings.checkpoint_seconds:
+            self.clock.read("training_seconds")
+            write_checkpoint(self.run.folder, self.model, self.record)
+            self.clock.read("seconds")
+            self.saved = time.monotonic()
+
+    def _on_step(self) -> bool:
+        for info in self.locals.get("infos", []):
+            if "episode" in info:
+                self.record["training"]["step"].append(self.num_timesteps)
+                self.record["training"]["score"].append(float(info["episode"]["r"]))
+                self.record["training"]["length"].append(int(info["episode"]["l"]))
+        if time.monotonic() - self.noted >= PROGRESS_SECONDS:
+            self.clock.read("training_seconds")
+            self.note_progress()
+        if self.is_due() and self.has_settled():
+            self.clock.read("training_seconds")
+            add_evaluation(self.model, self.run, self.record, "curve", self.curve_episodes)
+            self.clock.read("seconds")
+        return self.num_timesteps < self.steps
+
+    def _on_training_end(self) -> None:
+        self.clock.read("training_seconds")
+        self.note_progress()
+
+    def is_due(self) -> bool:
+        """
+        :return: whether a point of the learning curve has come since the last evaluation
+        """
+        last = max((row["step"] for row in self.record["evaluations"]), default=0)
+        return any(last < step <= self.num_timesteps < self.steps for step in self.due)
+
+    def has_settled(self) -> bool:
+        """
+        :return: whether half of the updates from one reset of the network to the next are done; a network that has just been
+            reset plays like a new one
+        """
+        resets: Resets | None = getattr(self.model, "_resets", None)
+        if resets is None or resets.schedule.interval is None or not resets.done:
+            return True
+        return 2 * resets.updates_since(self.model._n_updates) >= resets.schedule.interval  # type: ignore[attr-defined]
+
+    def note_progress(self) -> None:
+        """Write where the run is, for the table."""
+        seconds = self.record["training_seconds"] - self.first_second
+        rate = (self.num_timesteps - self.first_step) / seconds if seconds > 0 else 0.0
+        progress = {"step": self.num_timesteps, "steps": self.steps, "steps_per_second": rate, "host": platform.node()}
+        write_json(self.run.folder / PROGRESS, progress)
+        self.noted = time.monotonic()
+
+
+def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind: str, n_episodes: int) -> None:
+    """
+    :param kind: "curve" or "final"
+    """
+    scores, lengths = evaluate(model, run.protocol, n_episodes, run.seed)
+    record["evaluations"].append({"step": model.num_timesteps, "kind": kind, "scores": scores, "lengths": lengths})
 
 
 def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
@@ -72,6 +211,39 @@ def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
     return model, manager.callbacks
 
 
+def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[BaseAlgorithm, dict[str, Any], bool]:
+    """
+    As an EqR agent's ``resume``, for every agent of Stable-Baselines3.
+
+    :param checkpoint: of :func:`~sb3_eqr.common.checkpoints.write_checkpoint`
+    :param model: newly built, whose class, device and environment are used
+    :return: the agent that continues, what was measured so far, and whether it does so bit for bit; if not, with a new episode
+    """
+    checkpoint, manifest = checkpoints.read_manifest(checkpoint)
+    is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # which SB3 does not save
+    env = model.get_env()
+    assert env is not None
+    model = type(model).load(checkpoint / checkpoints.MODEL, env=env, device=model.device, force_reset=not is_exact)
+    if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
+        model.load_replay_buffer(checkpoint / checkpoints.BUFFER)
+        buffer = model.replay_buffer
+        if not is_exact and hasattr(buffer, "timeouts"):  # no n-step return across the gap
+            buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
+    env = model.get_env()
+    assert env is not None
+    checkpoints.restore_environment(env, checkpoint, wrappers_only=not is_exact)
+    if not is_exact:
+        env.seed((model.seed or 0) + model.num_timesteps)  # other episodes than at the start
+    checkpoints.restore_generators(model, manifest)
+    return model, decode(manifest["notes"]), is_exact
+
+
+def remove_checkpoints(folder: pathlib.Path) -> None:
+    """Those of a finished run, and what a killed one has left of them."""
+    for checkpoint in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*")]:
+        shutil.rmtree(checkpoint, ignore_errors=True)
+
+
 def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
     """
     :return: what was run and on what
@@ -98,9 +270,9 @@ def train(run: Run, settings: Settings) -> None:
         file.write(datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds") + "\n")
     model, callbacks = build(run, settings.device)
     record = new_record()
-    checkpoints = find_checkpoints(run.folder)
-    if checkpoints:
-        model, record, is_exact = load_checkpoint(checkpoints[-1], model)
+    found = find_checkpoints(run.folder)
+    if found:
+        model, record, is_exact = load_checkpoint(found[-1], model)
         record["resumed_at"].append(model.num_timesteps)
         record["resumed_exactly"] &= is_exact
     record["seconds"] += time.monotonic() - started
@@ -108,19 +280,17 @@ def train(run: Run, settings: Settings) -> None:
     if model.num_timesteps < steps:
         model.set_logger(Logger(folder=None, output_formats=[LossWriter(record["losses"])]))
         callback = RunCallback(run, record, settings)
-        model.learn(steps - model.num_timesteps, [*callbacks, callback], reset_num_timesteps=not checkpoints)
-        write_checkpoint(run.folder, model, record, is_final=True)
+        model.learn(steps - model.num_timesteps, [*callbacks, callback], reset_num_timesteps=not found)
+        write_checkpoint(run.folder, model, record, with_buffer=False)
     finishing = Clock(record)
     add_evaluation(model, run, record, "final", run.protocol["evaluation"]["episodes"])
     finishing.read("seconds")
-    seconds = record.pop("seconds")
-    rate = steps / max(record["training_seconds"], 1e-9)
     starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
     times = {
         "started": starts[0],
         "attempts": len(starts),
-        "wall_clock_s": round(seconds, 2),
-        "steps_per_second": round(rate, 2),
+        "wall_clock_s": round(record.pop("seconds"), 2),
+        "steps_per_second": round(steps / max(record["training_seconds"], 1e-9), 2),
     }
     write_json(run.folder / RESULT, {**provenance(run, model, settings), **times, **record})
     model.get_env().close()  # type: ignore[union-attr]

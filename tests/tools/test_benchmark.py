@@ -3,7 +3,6 @@
 import json
 import pathlib
 import sys
-from collections import deque
 from types import SimpleNamespace
 
 import pytest
@@ -13,10 +12,9 @@ from ray.exceptions import RayError
 from rich.console import Console
 
 from sb3_eqr import benchmark, cli
-from sb3_eqr.benchmark import runner
+from sb3_eqr.benchmark import dispatch
 from sb3_eqr.benchmark.agents import find_agent
-from sb3_eqr.benchmark.plan import State, plan_runs, read_plan, state_of, write_plan
-from sb3_eqr.benchmark.run import Settings
+from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
 
@@ -101,7 +99,7 @@ def test_ray_tries_a_run_that_crashes_twice_while_the_others_go_on(files, sb3_eq
     assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in out.out
     pathlib.Path("broken.yml").write_text(pathlib.Path("fast.yml").read_text())
     code, out = sb3_eqr(line)
-    assert code == 0 and [state_of(run).name for run in read_plan(pathlib.Path("b"))] == ["done", "done"]
+    assert code == 0 and [run.state().name for run in read_plan(pathlib.Path("b"))] == ["done", "done"]
 
 
 class Crash(RayError):
@@ -131,15 +129,14 @@ def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(f
     (files / "broken.yml").write_text(BROKEN)
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
 
-    def dispatch():
+    def all_runs():
         runs = plan_runs(files / "b", suite, ["dqn:broken.yml", "dqn:fast.yml"], 1)
         write_plan(files / "b", suite, runs)
-        states, ray = [state_of(run) for run in runs], InOneProcess()
-        waiting = deque(index for index, state in enumerate(states) if state.name != "done")
-        failed = runner.Dispatcher(ray, ray, runs, states, Settings(), Console()).finish(waiting)
+        ray, waiting = InOneProcess(), [run for run in runs if run.state().name != "done"]
+        failed = dispatch.finish(ray, ray, runs, waiting, Settings(), Console())
         return [run.agent.name for run in failed], capfd.readouterr().out
 
-    failed, out = dispatch()
+    failed, out = all_runs()
     assert failed == ["dqn:broken"]
     assert out.count("dqn:broken, CartPole, seed 0: crashed (ValueError") == 2
     assert "dqn:fast, CartPole, seed 0: finished" in out
@@ -147,9 +144,9 @@ def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(f
     _, shown = sb3_eqr("status b")
     assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in shown.out
     (files / "broken.yml").write_text((files / "fast.yml").read_text())
-    failed, out = dispatch()
+    failed, out = all_runs()
     assert failed == [] and "dqn:broken, CartPole, seed 0: finished" in out and "dqn:fast, CartPole, seed 0" not in out
-    assert [state_of(run).name for run in read_plan(files / "b")] == ["done", "done"]
+    assert [run.state().name for run in read_plan(files / "b")] == ["done", "done"]
 
 
 RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
@@ -299,14 +296,13 @@ def test_a_crash_without_words_or_with_brackets_does_not_stop_the_others(files, 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(runner, "atomic_write", full)
-    fake = SimpleNamespace(get=get, exceptions=SimpleNamespace(RayError=RayError))
-    task = SimpleNamespace(remote=lambda run, settings: "second")
-    dispatcher = runner.Dispatcher(fake, task, runs, [State("waiting", 0, 0.0)], Settings(), Console())
-    dispatcher.running = {"first": 0}
-    dispatcher.take_in("first")
-    dispatcher.take_in("second")
-    assert dispatcher.failed == [0] and capsys.readouterr().out.count("dqn:fast, CartPole, seed 0: crashed (") == 2
+    monkeypatch.setattr(dispatch, "atomic_write", full)
+    attempts = iter(("first", "second"))
+    exceptions = SimpleNamespace(RayError=RayError)
+    fake = SimpleNamespace(get=get, exceptions=exceptions, wait=lambda references, timeout: (references, []))
+    task = SimpleNamespace(remote=lambda run, settings: next(attempts))
+    assert dispatch.finish(fake, task, runs, runs, Settings(), Console()) == runs
+    assert capsys.readouterr().out.count("dqn:fast, CartPole, seed 0: crashed (") == 2
 
 
 def test_our_suites(tmp_path):

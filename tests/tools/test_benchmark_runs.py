@@ -11,13 +11,13 @@ from filelock import FileLock
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr.benchmark import evaluation, recording
+from sb3_eqr.benchmark import evaluation, training
 from sb3_eqr.benchmark.agents import Agent, find_agent
-from sb3_eqr.benchmark.checkpoints import find_checkpoints
 from sb3_eqr.benchmark.evaluation import EpsilonGreedy, GamesInTurn, evaluate, fits_atari_batch, make_evaluation_env
-from sb3_eqr.benchmark.run import ERROR, LOCK, RESULT, Run, Settings
+from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.benchmark.training import execute
+from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.common.env_state import capture, restore
 from sb3_eqr.envs import atari, atari_batch, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
@@ -66,14 +66,14 @@ def scores_of(run):
 def stop_at(monkeypatch, *steps):
     """Training stops with an exception when it first comes to each of these steps."""
     ahead = list(steps)
-    on_step = recording.RunCallback._on_step
+    on_step = training.RunCallback._on_step
 
     def step_or_stop(self):
         if ahead and self.num_timesteps >= ahead[0]:
             raise KeyError(f"stopped at {ahead.pop(0)}")
         return on_step(self)
 
-    monkeypatch.setattr(recording.RunCallback, "_on_step", step_or_stop)
+    monkeypatch.setattr(training.RunCallback, "_on_step", step_or_stop)
 
 
 @pytest.mark.parametrize("algo", AGENTS)
@@ -206,19 +206,19 @@ def test_a_run_that_another_process_has_is_left_alone(tmp_path):
 def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monkeypatch):
     undisturbed, full = make_run(tmp_path / "undisturbed", "qrdqn"), make_run(tmp_path / "full", "qrdqn")
     execute(undisturbed, Settings())
-    save, calls = recording.write_checkpoint, []
+    save, calls = training.write_checkpoint, []
 
-    def no_space_at_the_fifth(folder, model, record, is_final=False):
+    def no_space_at_the_fifth(folder, model, record, with_buffer=True):
         calls.append(model.num_timesteps)
         if len(calls) == 5:
             monkeypatch.setattr(type(model), "save_replay_buffer", no_space)
-        save(folder, model, record, is_final)
+        save(folder, model, record, with_buffer=with_buffer)
 
     def no_space(self, path):
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(recording, "write_checkpoint", no_space_at_the_fifth)
+    monkeypatch.setattr(training, "write_checkpoint", no_space_at_the_fifth)
     with monkeypatch.context(), pytest.raises(OSError, match="No space left"):
         execute(full, Settings(checkpoint_seconds=0.0))
     assert [path.name for path in full.folder.glob("*checkpoint*")] == [f"checkpoint-{calls[3]:012d}"]
@@ -389,11 +389,11 @@ def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
         execute(run, Settings(checkpoint_seconds=0.0))
     counts = []
     monkeypatch.setattr(
-        recording.RunCallback,
+        training.RunCallback,
         "_on_training_start",
         lambda self: counts.append(self.model.get_vec_normalize_env().obs_rms.count),
     )
-    monkeypatch.setattr(recording.RunCallback, "note_progress", lambda self: None)
+    monkeypatch.setattr(training.RunCallback, "note_progress", lambda self: None)
     execute(run, Settings())
     assert counts == [pytest.approx(96, abs=10)]  # what it knew of the observations' scale
     result = result_of(run)

@@ -1,5 +1,6 @@
-"""What a benchmark is to run, and where it stands: folders of runs, the same for every process that looks at them."""
+"""The runs of a benchmark as folders: what each is to do, and where it stands, the same for every process that looks."""
 
+import dataclasses
 import json
 import pathlib
 from typing import Any, NamedTuple
@@ -7,13 +8,31 @@ from typing import Any, NamedTuple
 from filelock import FileLock, Timeout
 
 from sb3_eqr.benchmark.agents import Agent, find_agent, hyperparameters
-from sb3_eqr.benchmark.checkpoints import find_checkpoints
 from sb3_eqr.benchmark.evaluation import check_game
-from sb3_eqr.benchmark.run import ERROR, LOCK, PLAN, PROGRESS, RESULT, Run, to_json, write_json
 from sb3_eqr.benchmark.selection import flatten
-from sb3_eqr.benchmark.suites import Suite, read_suite, write_suite
+from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
+from sb3_eqr.common.checkpoints import find_checkpoints
+from sb3_eqr.common.files import atomic_write
 
-SUITE = "suite.yml"
+SUITE = "suite.yml"  # of the benchmark
+RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # of a run
+STARTS = "starts.txt"  # a line whenever a run is begun or resumed
+
+
+class Settings(Strict):
+    """
+    What does not change a score.
+
+    :param command: to repeat the benchmark
+    :param device: of PyTorch
+    :param n_threads: of PyTorch
+    :param checkpoint_seconds: between two checkpoints
+    """
+
+    command: str = ""
+    device: str = "auto"
+    n_threads: int = 1
+    checkpoint_seconds: float = 300.0
 
 
 class State(NamedTuple):
@@ -26,6 +45,77 @@ class State(NamedTuple):
     name: str
     step: int
     steps_per_second: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """
+    One agent on one game with one seed.
+
+    :param folder: of the run
+    :param agent: the agent
+    :param suite: name of the suite
+    :param game: name of the game
+    :param seed: of everything
+    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :param entry: of :func:`~sb3_eqr.benchmark.agents.hyperparameters`
+    """
+
+    folder: pathlib.Path
+    agent: Agent
+    suite: str
+    game: str
+    seed: int
+    protocol: dict[str, Any]
+    entry: dict[str, Any]
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return f"{self.agent.name}, {self.game}, seed {self.seed}"
+
+    def description(self) -> dict[str, Any]:
+        """What was asked for, for ``run.json``."""
+        return {
+            "agent": self.agent.name,
+            "game": self.game,
+            "seed": self.seed,
+            "suite": self.suite,
+            "protocol": self.protocol,
+            "entry": {"algo": self.agent.algo, "file": str(self.agent.file), "hyperparameters": self.entry},
+        }
+
+    def state(self) -> State:
+        """Where it stands."""
+        steps = self.protocol["steps"]
+        if (self.folder / RESULT).is_file():
+            return State("done", steps, 0.0)
+        found = self.folder / PROGRESS
+        progress = json.loads(found.read_text(encoding="utf-8")) if found.is_file() else {}
+        if self.is_locked():
+            return State("running", progress.get("step", 0), progress.get("steps_per_second", 0.0))
+        return State("failed" if (self.folder / ERROR).is_file() else "waiting", progress.get("step", 0), 0.0)
+
+    def is_locked(self) -> bool:
+        """Whether a process has it."""
+        if not (self.folder / LOCK).is_file():
+            return False
+        try:
+            with FileLock(self.folder / LOCK, blocking=False):
+                return False
+        except Timeout:
+            return True
+
+
+def to_json(value: Any) -> str:
+    """As it is written into files."""
+    return json.dumps(value, indent=1, default=str)
+
+
+def write_json(path: pathlib.Path, value: Any) -> None:
+    """Write a file beside ``path`` and rename it."""
+    with atomic_write(path, "json") as file:
+        file.write(to_json(value).encode())
 
 
 def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int) -> list[Run]:
@@ -45,34 +135,26 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
     names = [agent.name for agent in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"--agents: expected different agents, found {', '.join(sorted(twice))} more than once")
-    entries = {}
+    runs = []
     for game in suite.games:
-        action_space = check_game(suite.protocol(game))
+        protocol = suite.protocol(game)
+        action_space = check_game(protocol)
         for agent in found:
-            entries[agent, game] = hyperparameters(agent, suite.protocol(game), action_space)
-    runs = [
-        Run(run_folder(folder, *key, seed), key[0], suite.name, key[1], seed, suite.protocol(key[1]), entry)
-        for seed in range(n_seeds)
-        for key, entry in entries.items()
-    ]
+            entry = hyperparameters(agent, protocol, action_space)
+            for seed in range(n_seeds):
+                place = folder / "runs" / agent.name.replace(":", "-") / game / str(seed)
+                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry))
     for run in runs:
-        check_plan(run)
-    return runs
+        _check_plan(run)
+    return sorted(runs, key=lambda run: run.seed)
 
 
-def run_folder(folder: pathlib.Path, agent: Agent, game: str, seed: int) -> pathlib.Path:
-    """
-    :return: the folder of a run
-    """
-    return folder / "runs" / agent.name.replace(":", "-") / game / str(seed)
-
-
-def check_plan(run: Run) -> None:
+def _check_plan(run: Run) -> None:
     """
     :raises ValueError: if the folder holds the same run, begun with other settings
     """
     path = run.folder / PLAN
-    begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or is_locked(run)
+    begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or run.is_locked()
     if not (path.is_file() and begun):
         return
     old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(to_json(run.description()))
@@ -104,11 +186,7 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
         suite = suite.model_copy(update=update)
     write_suite(suite, path)
     for run in runs:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        description = to_json(run.description())
-        path = run.folder / PLAN
-        if not (path.is_file() and path.read_text(encoding="utf-8") == description):
-            write_json(path, run.description())
+        write_json(run.folder / PLAN, run.description())
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:
@@ -128,48 +206,3 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
             "sb3-eqr benchmark run DIR --suite SUITE --agents AGENT ..."
         )
     return runs
-
-
-def state_of(run: Run) -> State:
-    """
-    :return: where a run stands
-    """
-    steps = run.protocol["steps"]
-    if (run.folder / RESULT).is_file():
-        return State("done", steps, 0.0)
-    progress = read_progress(run)
-    if is_locked(run):
-        return State("running", progress.get("step", 0), progress.get("steps_per_second", 0.0))
-    return State("failed" if (run.folder / ERROR).is_file() else "waiting", progress.get("step", 0), 0.0)
-
-
-def read_progress(run: Run) -> dict[str, Any]:
-    """
-    :return: step, steps, steps_per_second, host; empty before the first note
-    """
-    try:
-        return json.loads((run.folder / PROGRESS).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-
-
-def is_locked(run: Run) -> bool:
-    """
-    :return: whether a process has the run
-    """
-    if not (run.folder / LOCK).is_file():
-        return False
-    try:
-        with FileLock(run.folder / LOCK, blocking=False):
-            return False
-    except Timeout:
-        return True
-
-
-def seconds_left(runs: list[Run], states: list[State]) -> float | None:
-    """
-    :return: at the speed of the runs that are running; ``None`` if none is
-    """
-    rate = sum(state.steps_per_second for state in states)
-    left = sum(run.protocol["steps"] - state.step for run, state in zip(runs, states, strict=True) if state.name != "failed")
-    return left / rate if rate > 0 else None

@@ -1,0 +1,167 @@
+"""Finishing all runs of a benchmark: a task of Ray for each, and the table that shows where they are."""
+
+import contextlib
+import datetime
+import logging
+import os
+import socket
+import time
+from collections import Counter
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from sb3_eqr.benchmark.runs import ERROR, Run, Settings, State
+from sb3_eqr.benchmark.training import execute
+from sb3_eqr.common.files import atomic_write
+
+ATTEMPTS = 2  # a run that crashes is retried once
+REFRESH_SECONDS = 2.0
+BUSY_SECONDS = 5.0  # before a run that another process has is asked for again
+
+
+def make_table(runs: list[Run], states: list[State]) -> Table:
+    """
+    :param runs: of the benchmark
+    :param states: as many
+    :return: a row per agent, and one for all
+    """
+    table = Table(box=None, pad_edge=False, caption_justify="left")
+    for column in ("agent", "done", "running", "waiting", "failed", "steps", "steps/s"):
+        table.add_column(column, justify="left" if column == "agent" else "right")
+    for name in [*dict.fromkeys(run.agent.name for run in runs), "all"]:
+        rows = [(run, state) for run, state in zip(runs, states, strict=True) if name in (run.agent.name, "all")]
+        counts = Counter(state.name for _, state in rows)
+        left = sum(run.protocol["steps"] - state.step for run, state in rows if state.name != "failed")
+        share = sum(state.step for _, state in rows) / sum(run.protocol["steps"] for run, _ in rows)
+        rate = sum(state.steps_per_second for _, state in rows)
+        cells = [f"{counts['done']}/{len(rows)}", *(str(counts[key] or "") for key in ("running", "waiting", "failed"))]
+        table.add_row(name, *cells, f"{share:.0%}", f"{rate:.0f}" if rate else "")
+    if rate > 0:  # of all, the last row
+        seconds = round(left / rate)
+        table.caption = f"about {datetime.timedelta(seconds=seconds)} left" if seconds else "in the last evaluations"
+    return table
+
+
+def run_benchmark(
+    runs: list[Run],
+    settings: Settings,
+    address: str | None = None,
+    cpus_per_run: float = 1.0,
+    gpus_per_run: float = 0.0,
+    console: Console | None = None,
+) -> list[Run]:
+    """
+    Finish all runs: those that are finished are skipped, broken ones go on from their last checkpoint, those that another
+    process has are waited for, one that crashes twice is left while the others go on.
+
+    :param runs: of the benchmark
+    :param settings: of all runs
+    :param address: of a Ray cluster that sees the benchmark's folder; ``None``: this machine
+    :param cpus_per_run: CPUs that Ray reserves for a run
+    :param gpus_per_run: GPUs, such as 0.1 for ten runs on each
+    :param console: where the table is shown
+    :return: the runs that failed
+    :raises ImportError: without Ray
+    :raises ConnectionError: if there is no cluster at the address
+    :raises ValueError: if no machine of the cluster can hold a run, which would wait forever
+    """
+    console = console or Console()
+    waiting = [run for run in runs if run.state().name != "done"]
+    if len(waiting) < len(runs):
+        console.print(f"{len(runs) - len(waiting)} of {len(runs)} runs are finished already.")
+    if not waiting:
+        return []
+    console.print("Connecting to Ray ..." if address else "Starting Ray ...")
+    ray = _start_ray(address)
+    try:
+        for name, flag, needed in (("CPU", "--cpus-per-run", cpus_per_run), ("GPU", "--gpus-per-run", gpus_per_run)):
+            there = max((node["Resources"].get(name, 0) for node in ray.nodes() if node["Alive"]), default=0)
+            if needed > there:
+                raise ValueError(f"{flag}: expected at most the {there:g} {name}s of the largest machine, found {needed:g}")
+        task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=0)(execute)
+        return finish(ray, task, runs, waiting, settings, console)
+    finally:
+        ray.shutdown()
+
+
+def _start_ray(address: str | None) -> Any:
+    """The module, connected to the cluster at the address, or to one that it starts on this machine."""
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError('benchmark run needs Ray: pip install "sb3-eqr[benchmark]"') from error
+    host, _, port = (address or "").rpartition(":")
+    if host and port.isdigit() and "/" not in host:  # else "auto", or another form of Ray's
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except OSError as error:  # for which Ray would wait minutes and then end the process
+            raise ConnectionError(
+                f"--address: no Ray cluster answers at {address} ({error}). Start one: ray start --head"
+            ) from error
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray's own warning asks for
+    local: dict[str, Any] = {} if address else {"include_dashboard": False}
+    ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
+    return ray
+
+
+def finish(ray: Any, task: Any, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
+    """
+    :param ray: the module, connected
+    :param task: the remote function of a run
+    :param runs: of the benchmark
+    :param waiting: those that are not finished
+    :param settings: of all runs
+    :param console: where the table is shown
+    :return: the runs that failed
+    """
+    states = [run.state() for run in runs]
+    running = {task.remote(run, settings): run for run in waiting}
+    busy: list[tuple[float, Run]] = []  # when to ask again
+    crashes: Counter[str] = Counter()
+    failed = []
+    with Live(make_table(runs, states), console=console, auto_refresh=False, transient=True) as live:
+        while running or busy:
+            now = time.monotonic()
+            running |= {task.remote(run, settings): run for when, run in busy if when <= now}
+            busy = [(when, run) for when, run in busy if when > now]
+            if not running:
+                time.sleep(REFRESH_SECONDS)
+            for reference in ray.wait(list(running), timeout=REFRESH_SECONDS)[0] if running else []:
+                run = running.pop(reference)
+                try:
+                    is_busy = ray.get(reference) == "busy"
+                except ray.exceptions.RayError as error:
+                    crashes[run.label] += 1
+                    is_lost = crashes[run.label] == ATTEMPTS
+                    _note_crash(run, error, is_lost, console)
+                    if is_lost:
+                        failed.append(run)
+                    else:
+                        running[task.remote(run, settings)] = run
+                    continue
+                if is_busy:
+                    busy.append((time.monotonic() + BUSY_SECONDS, run))
+                else:
+                    _say(console, f"{run.label}: finished")
+            states = [state if state.name == "done" else run.state() for run, state in zip(runs, states, strict=True)]
+            live.update(make_table(runs, states), refresh=console.is_terminal)
+    console.print(make_table(runs, states))
+    return failed
+
+
+def _note_crash(run: Run, error: Exception, is_lost: bool, console: Console) -> None:
+    cause = getattr(error, "cause", None) or error
+    reason = " ".join([type(cause).__name__, *str(cause).strip().splitlines()[-1:]])
+    _say(console, f"{run.label}: crashed ({reason}). {f'See {run.folder / ERROR}' if is_lost else 'Trying once more.'}")
+    if is_lost and not (run.folder / ERROR).is_file():  # it was killed before it could say anything
+        with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
+            file.write(str(error).encode())
+
+
+def _say(console: Console, text: str) -> None:
+    """A line above the table."""
+    console.print(text, soft_wrap=True, markup=False, highlight=False)
