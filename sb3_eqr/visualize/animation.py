@@ -2,13 +2,13 @@
 
 import pathlib
 import random
-from collections.abc import Generator, Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from PIL import Image
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
@@ -18,7 +18,7 @@ from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
-from sb3_eqr.visualize.canvas import HEIGHT, WIDTH, Line, Painter
+from sb3_eqr.visualize.canvas import Line, Painter
 from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode, group_model
 from sb3_eqr.visualize.loading import action_names
 from sb3_eqr.visualize.pixels import observed_pictures
@@ -28,8 +28,8 @@ MAX_PANELS = 36
 MAX_LETTERS = 45  # of the group's name
 FPS = 15  # Atari's 60 frames a second, of which an agent sees every fourth
 FORMATS = ("mp4", "gif")
-GIF_COLOURS = 64
-GIF_INTERVAL = 2  # every so many frames one is in the GIF
+EVERY = {"mp4": 1, "gif": 2}  # every so many frames one is written
+OPTIONS: dict[str, dict[str, Any]] = {"mp4": {"quality": 8, "macro_block_size": 2}, "gif": {"loop": 0}}  # of imageio
 
 
 class Film(NamedTuple):
@@ -192,54 +192,27 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
     :param fps: frames per second
     :return: the files
     """
-    paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
-    with ExitStack() as stack:
-        files = {suffix: stack.enter_context(atomic_write(p, suffix)) for suffix, p in zip(formats, paths, strict=True)}
-        movie = None
-        if "mp4" in formats:
-            movie = _open_movie(files["mp4"].name, fps)
-            stack.callback(_close_movie, movie, files["mp4"].name)  # before the file takes its place
-        kept = []
-        for t, image in enumerate(images):
-            if movie is not None:
-                movie.send(np.ascontiguousarray(image))
-            if "gif" in formats and t % GIF_INTERVAL == 0:
-                kept.append(Image.fromarray(image))
-        if kept:
-            _write_gif(kept, files["gif"], fps / GIF_INTERVAL)
-    return paths
-
-
-def _open_movie(path: str, fps: float) -> Generator[None, np.ndarray | None, None]:
     try:
-        from imageio_ffmpeg import write_frames  # what imageio writes with, for a file of any name
+        import imageio.v2 as imageio
     except ImportError as error:
-        raise ImportError('MP4 needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
-    size = (WIDTH, HEIGHT)
-    movie = write_frames(
-        path, size, fps=fps, pix_fmt_out="yuv420p", macro_block_size=2, quality=8, output_params=["-f", "mp4"]
-    )
-    movie.send(None)  # starts
-    return movie
-
-
-def _close_movie(movie: Generator, path: str) -> None:
-    """imageio does not look at how ffmpeg ended: a movie that cannot be read again must not replace a good one."""
-    movie.close()
-    from imageio_ffmpeg import count_frames_and_secs
-
-    count_frames_and_secs(path)  # raises where there is no whole movie
-
-
-def _write_gif(images: list[Image.Image], file: BinaryIO, fps: float) -> None:
-    """With one palette for all, so that what stands still costs nothing."""
-    some = images[:: max(len(images) // 8, 1)]
-    strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
-    for i, image in enumerate(some):
-        strip.paste(image, (0, i * image.height))
-    palette = strip.quantize(GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE)  # rare colours count: arrows are thin
-    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0, optimize=False)
+        raise ImportError('A video needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
+    paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
+    with tempfile.TemporaryDirectory() as folder:
+        aside = {suffix: pathlib.Path(folder) / f"film.{suffix}" for suffix in formats}
+        with ExitStack() as stack:
+            rates = {"mp4": {"fps": fps}, "gif": {"duration": 1000 * EVERY["gif"] / fps}}
+            writers: dict[str, Any] = {
+                suffix: stack.enter_context(imageio.get_writer(file, mode="I", **{**OPTIONS[suffix], **rates[suffix]}))
+                for suffix, file in aside.items()
+            }
+            for t, image in enumerate(images):
+                for suffix, writer in writers.items():
+                    if t % EVERY[suffix] == 0:
+                        writer.append_data(image)
+        for suffix, one in zip(formats, paths, strict=True):
+            with atomic_write(one, suffix) as file:
+                file.write(aside[suffix].read_bytes())
+    return paths
 
 
 def _first_envs(observations: list[Any]) -> Any:

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SO, Group
+from sb3_eqr.plot_style import GREY, settings
 from sb3_eqr.visualize.latents import frame, split
 from sb3_eqr.visualize.measures import ROUNDING
-from sb3_eqr.visualize.style import GREY, MAX_PANELS, SIZE, panels, settings
+from sb3_eqr.visualize.style import MAX_PANELS, SIZE, panels
 
 MAX_POINTS = 400
 MAX_ARROWS = 150

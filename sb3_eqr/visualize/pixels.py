@@ -5,14 +5,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from PIL import Image, ImageDraw
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_eqr.visualize.canvas import BLUE, FAINT, LINE, PAPER, font
-
-ROW = 22  # height of a bar, in pixels
+ROW, HALF = 22, 170  # height of a bar and of its room, and half the width of a picture, in pixels
 MAX_ROWS = 16
-BAR_WIDTH = 340
+BAR, MIDDLE = (20, 70, 160), (160, 160, 160)
 
 
 def observed_pictures(observations: Any, space: spaces.Space, frame_stack: int) -> list[np.ndarray]:
@@ -42,30 +39,19 @@ def observed_pictures(observations: Any, space: spaces.Space, frame_stack: int) 
 
 def bars(values: np.ndarray) -> list[np.ndarray]:
     """
-    Numbers as bars from 0, each on a scale of its own that stays the same.
+    Numbers as bars from 0, in the middle, each on a scale of its own that stays the same.
 
-    :param values: (T, n)
+    :param values: (T, n), of which the first are shown
     :return: T of (height, width, 3), uint8
     """
     shown = values[:, :MAX_ROWS]
-    scale = np.maximum(np.abs(shown).max(axis=0), 1e-9)
-    more = values.shape[1] - shown.shape[1]
-    return [_bar_picture(row, row / scale, more) for row in shown]
-
-
-def _bar_picture(values: np.ndarray, lengths: np.ndarray, more: int) -> np.ndarray:
-    image = Image.new("RGB", (BAR_WIDTH, ROW * (len(values) + (more > 0))), PAPER)
-    draw = ImageDraw.Draw(image)
-    middle = BAR_WIDTH * 9 // 16
-    for i, (value, length) in enumerate(zip(values, lengths, strict=True)):
-        y = i * ROW
-        end = middle + round(float(length) * (BAR_WIDTH - middle - 8))
-        draw.rectangle([min(middle, end), y + 5, max(middle, end), y + ROW - 6], BLUE)
-        draw.text((4, y + ROW // 2), f"{value:+.3g}", FAINT, font(12), anchor="lm")
-    draw.line([(middle, 0), (middle, ROW * len(values))], LINE, 1)
-    if more > 0:
-        draw.text((4, image.height - ROW // 2), f"and {more} more", FAINT, font(12), anchor="lm")
-    return np.asarray(image)
+    ends = HALF * shown / np.maximum(np.abs(shown).max(axis=0), 1e-9)  # (T, n)
+    place = np.arange(-HALF, HALF + 1)  # of a pixel
+    inside = (place >= np.minimum(ends, 0)[..., None]) & (place <= np.maximum(ends, 0)[..., None])  # (T, n, width)
+    pictures = np.full((*inside.shape[:2], ROW, len(place), 3), 255, dtype=np.uint8)
+    pictures[:, :, 3:-3][np.broadcast_to(inside[:, :, None], (*inside.shape[:2], ROW - 6, len(place)))] = BAR
+    pictures[:, :, :, HALF] = MIDDLE
+    return list(pictures.reshape(len(shown), -1, len(place), 3))
 
 
 def _coloured(planes: np.ndarray) -> np.ndarray:

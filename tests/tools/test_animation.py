@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from PIL import ImageDraw
 from stable_baselines3 import DQN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -187,20 +186,14 @@ def test_blocks_are_numbered_from_zero(make):
     assert [found.name for found in panels(model, states, states, 9)] == ["0 SE(2)", "1 SE(2)", "2 SO(3)"]
 
 
-@pytest.mark.parametrize("name, said", [("SO(3)", "solid: now"), ("SE(3)", "pale: predicted 2"), ("SE(2)", "predicted 2")])
-def test_the_legend_is_of_what_is_drawn(name, said, monkeypatch):
-    """Axes have their own colours, and their letters are in these."""
-    written = []
-    text = ImageDraw.ImageDraw.text
-    monkeypatch.setattr(
-        ImageDraw.ImageDraw,
-        "text",
-        lambda self, at, what, fill, *args, **kw: (written.append((what, fill)), text(self, at, what, fill, *args, **kw)),
-    )
-    Painter([panel("0", *elements(name), elements(name)[1])], np.zeros(7, int), 2, "about" * 99)
-    assert any(what.startswith(said) for what, _ in written)
-    letters = {what: fill for what, fill in written if what in "xyz"}
-    assert letters == ({} if name == "SE(2)" else dict(zip("xyz", AXES, strict=True)))
+@pytest.mark.parametrize("name, letters", [("SO(3)", ["x", "y", "z"]), ("SE(3)", ["x", "y", "z"]), ("SE(2)", [])])
+def test_the_legend_is_of_what_is_drawn(name, letters):
+    """Axes have colours of their own."""
+    painter = Painter([panel("0", *elements(name), elements(name)[1])], np.zeros(7, int), 2, "about" * 99)
+    (legend,) = painter.figure.legends
+    said = {text.get_text(): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
+    assert list(said)[:2] == ["now", "predicted 2 steps before"]
+    assert {key: color for key, color in said.items() if key in "xyz"} == dict(zip(letters, AXES[: len(letters)], strict=True))
 
 
 @EITHER
@@ -283,17 +276,31 @@ def test_what_cannot_be_filmed_is_refused(make, tmp_path):
 
 
 def test_the_frame_shows_truth_and_ghost():
-    """Blue at the tip of the arrow, orange at the ghost's; without a ghost nothing is orange."""
+    """Blue along the arrow, orange along the ghost's; without a ghost nothing is orange. A picture keeps its shape."""
     truth = Shape(np.array([[[0.0, 0.85]]] * 2), None)
     ghost = Shape(np.array([[[np.nan, np.nan]], [[0.85, 0.0]]]), None)
     painter = Painter([Panel("1", "arrow", truth, ghost, None)], np.zeros(2, int), 1, "")
-    (x, y), side = painter.corners[0], painter.side
-    first, second = (painter.paint(t, np.zeros((4, 4, 3), np.uint8), Line(t, "up", 0, 0)).astype(int) for t in (0, 1))
-    up = second[y + side // 4, x + side // 2]
-    right = second[y + side // 2, x + 3 * side // 4]
-    assert up[2] > up[0] + 50 and right[0] > right[2] + 50
-    inside = first[y : y + side, x : x + side]
-    assert not (inside[..., 0] > inside[..., 2] + 50).any()
+    picture = np.full((50, 100, 3), (0, 255, 0), np.uint8)
+    first, second = (painter.paint(t, picture, Line(t, "up", 0, 0)).astype(int) for t in (0, 1))
+
+    def pixel(frame, x, y):
+        """At a place in the panel, whose edges are at ±1."""
+        column, row = painter.axes[0].transData.transform((x, y))
+        return frame[HEIGHT - round(row), round(column)]
+
+    assert pixel(second, 0, 0.5)[2] > pixel(second, 0, 0.5)[0] + 50
+    assert pixel(second, 0.5, 0)[0] > pixel(second, 0.5, 0)[2] + 50
+    assert not (first[:, 400:][..., 0] > first[:, 400:][..., 2] + 50)[60:-60].any()  # the legend has orange
+    green = (first == (0, 255, 0)).all(axis=2)
+    assert green.any(axis=0).sum() == pytest.approx(2 * green.any(axis=1).sum(), abs=4)
+
+
+def test_a_block_beyond_its_panel_is_a_triangle_at_the_edge():
+    truth, ghost = Shape(None, np.zeros((1, 2))), Shape(None, np.array([[30.0, 0.0]]))
+    painter = Painter([Panel("1", "dot", truth, ghost, 1.0)], np.zeros(1, int), 1, "")
+    (shown,) = painter.blocks[0][0].move(0)
+    assert np.allclose(shown.get_xydata(), [[0.95, 0.0]]) and shown.get_marker() == (3, 0, -90)
+    assert "beyond the edge" in [text.get_text() for text in painter.figure.legends[0].get_texts()]
 
 
 # --- the callback
