@@ -178,6 +178,6 @@ def _tell(model: EqRQRDQN, remedies: dict[str, bool]) -> None:
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
         open_remedies = " or ".join(remedy for remedy, is_open in remedies.items() if is_open)
-        warnings.warn(f"train_representation: states and actions are nearly constant. {found.summary}. Pass {open_remedies}.")
+        warnings.warn(f"train_representation: states and actions are nearly constant. Pass {open_remedies}.")
     elif model.verbose > 0:
         print(found.summary)

@@ -69,7 +69,8 @@ def run(args: argparse.Namespace) -> None:
     if args.video:
         write_video(model, env, folder, depth, args)
     print(diagnostics.summary)
-    print(tables["transition"][["steps_ahead", "loss", "loss_shuffled", "loss_still"]].to_string(index=False))
+    table = tables["transition"][["steps_ahead", "loss", "loss_shuffled", "loss_still"]]
+    print(table.to_string(index=False, float_format="{:.2g}".format))
     print(f"Written: {folder}")
 
 

@@ -25,6 +25,13 @@ from sb3_eqr.visualize.measures import Rewards, Transition
 
 MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
 PREDICTS = 0.25  # the least skill, and the least gain
+SENTENCES = {
+    "predicts": "The latent model predicts: {removed}. Nothing needs to be done.",
+    "does not predict": "The latent model does not predict: {removed}. Train longer, with prediction_depth and aet_coef above "
+    "0; where that changes nothing, transition.csv says at which step it fails.",
+    "collapsed": "The latent states have collapsed, all of them are nearly one: {removed}. Keep reward_coef above 0, lower "
+    'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
+}
 COLLAPSED = 1e-3  # of squared distance on the unit sphere: directions within two degrees of each other
 
 
@@ -46,13 +53,13 @@ class Diagnostics(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """One line for humans."""
+        """The verdict in one plain sentence, and what to do in a second one."""
         skill, gain = skill_and_gain(self.loss)
-        return (
-            f"{self.verdict}: over {len(self.loss.error)} steps the rollout removes {_share(skill)} of the error of knowing "
-            f"nothing and {_share(gain)} of that of standing still; effective rank {self.collapse.effective_rank:.1f} of "
-            f"{self.collapse.dimensions}; {self.collapse.dead_units:.0%} of the trunk's units dead"
+        removed = (
+            f"over {len(self.loss.error)} steps it removes {_share(skill)} of the error of knowing nothing and {_share(gain)} "
+            "of that of standing still"
         )
+        return SENTENCES[self.verdict].format(removed=removed)
 
 
 def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:

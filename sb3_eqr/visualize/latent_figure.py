@@ -18,6 +18,7 @@ from sb3_eqr.visualize.style import MAX_PANELS, SIZE, panels
 
 MAX_POINTS = 400
 MAX_ARROWS = 150
+ABOUT = "A point is a state: where a block moves the origin to, an arrow what it turns; or principal components."
 CYCLIC = ("position", "angle")  # factors whose ends may be one: they get a colour map without a seam
 
 
@@ -53,9 +54,10 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
             ax.tick_params(labelsize=6, length=2, pad=1)
         figure.subplots_adjust(left=0.07, right=0.85, bottom=0.07, top=0.87, wspace=0.35, hspace=0.45)
         bar = figure.colorbar(drawn, cax=figure.add_axes((0.88, 0.12, 0.02, 0.7)))
-        bar.set_label(label)
+        bar.set_label("time (steps)" if label == "time" else label)
         of_all = "" if len(shown) == len(blocks) else f" ({len(shown)} of {len(blocks)} blocks: those that vary most)"
         figure.suptitle(f"Latent states{of_all}", fontsize=10)
+        figure.text(0.46, 0.005, ABOUT, ha="center", fontsize=7, color=GREY)
         return figure
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, settings
@@ -27,6 +27,7 @@ DPI = 150
 MAX_COORDINATES = 6  # of a block, in one panel
 MAX_NUMBERS = 36  # in a heat map
 MAX_NUMBER_COLUMNS = 6  # of one: else they run into each other
+PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # in place of powers of ten
 MAX_LETTERS = 72  # beside each other at the foot of a figure
 
 
@@ -44,7 +45,7 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
             "generators": generators_figure(diagnostics, actions),
             "disentanglement": disentanglement_figure(diagnostics, factors),
             "collapse": spectrum_figure(diagnostics),
-            "rewards": rewards_figure(diagnostics),
+            **({"rewards": rewards_figure(diagnostics)} if has_rewards(diagnostics) else {}),
         }
 
 
@@ -59,11 +60,12 @@ def transition_figure(diagnostics: Diagnostics) -> Figure:
     """Errors of the rollout per step ahead beside those of knowing nothing and of standing still."""
     figure = Figure(figsize=SIZE, layout="constrained")
     left, right = figure.subplots(1, 2)
-    _errors(left, diagnostics.transition, "latent space: mean ‖x̂ − x‖²")
-    _errors(right, diagnostics.loss, "as trained: unit vectors p(x̂), p(x)")
+    _errors(left, diagnostics.transition, "of latent states x̂, x")
+    _errors(right, diagnostics.loss, "of unit vectors p(x̂), p(x), as trained")
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(f"Transition: {diagnostics.verdict}", fontsize=10)
+    left.set_ylabel("mean squared distance")
+    figure.suptitle(f"Error of the predicted latent states: {diagnostics.verdict}", fontsize=10)
     return figure
 
 
@@ -73,6 +75,9 @@ def _errors(ax: Axes, errors: Transition, title: str) -> None:
     ax.set_title(title, loc="left")
     if max(np.nanmax(values, initial=0) for values in named.values()) > 0:
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(PLAIN)
+        ax.yaxis.set_minor_formatter(NullFormatter())
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=12))
 
 
 def _lines(ax: Axes, named: dict[str, np.ndarray]) -> None:
@@ -93,7 +98,8 @@ def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
         _block_ticks(ax, diagnostics.blocks)
     axes[0].set_yticks(range(len(actions)), actions, fontsize=8 if len(actions) < 12 else 6)
     axes[0].set_ylabel("action")
-    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
+    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
+    bar.set_label("mean distance that an action moves a block")
     return figure
 
 
@@ -131,8 +137,10 @@ def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figur
     for ax in axes[-n_columns(len(axes)) :]:
         labels = actions if len(actions) <= 6 else [str(a) for a in range(len(actions))]
         upright = max(map(len, labels)) * len(labels) * n_columns(len(axes)) > MAX_LETTERS
+        ax.set_xlabel("action")
         ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
     figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=6)
+    figure.supylabel("coordinate: radians, or latent units", fontsize=9)
     part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks: those it moves most)"
     figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
     return figure
@@ -175,7 +183,8 @@ def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()
         _heat_map(axes[1], found.information.T, "information on true factors", 1)
         _block_ticks(axes[1], diagnostics.blocks)
         axes[1].set_yticks(range(len(names)), names)
-    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
+    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
+    bar.set_label("0: independent, 1: one says all of the other")
     return figure
 
 
@@ -199,6 +208,7 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if seen[0] > 0:
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(PLAIN)
         ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
     ax.set_title(
@@ -207,6 +217,11 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         loc="left",
     )
     return figure
+
+
+def has_rewards(diagnostics: Diagnostics) -> bool:
+    """Whether the reward predictor was trained and any reward varies."""
+    return diagnostics.rewards_trained and not np.isnan(diagnostics.rewards.explained).all()
 
 
 def rewards_figure(diagnostics: Diagnostics) -> Figure:
@@ -221,9 +236,5 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
     _lines(right, {"explained": found.explained})
     right.axhline(0, color=GREY, linewidth=0.6)
     right.set_title("explained variance (1: exact)", loc="left")
-    if np.isnan(found.explained).all():
-        right.text(0.5, 0.6, "no reward varies", transform=right.transAxes, ha="center")
-        right.set(xticks=[], yticks=[])
-    never = "" if diagnostics.rewards_trained else ": not trained (reward_coef or prediction_depth is 0)"
-    figure.suptitle(f"Reward prediction{never}", fontsize=10)
+    figure.suptitle("Reward prediction", fontsize=10)
     return figure
