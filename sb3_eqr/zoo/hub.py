@@ -10,7 +10,6 @@ from typing import Any, NoReturn
 import huggingface_hub
 import huggingface_sb3
 import requests
-from huggingface_hub.repocard import metadata_eval_result
 
 DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {
@@ -66,30 +65,13 @@ class DryHub(CheckedHub):
         raise SystemExit(0)  # before RL Zoo tells of a success
 
 
-def generate_metadata(model_name: str, env_id: str, mean_reward: float, std_reward: float) -> dict[str, Any]:
+def generate_metadata(*args: Any) -> dict[str, Any]:
     """
-    The head of a model card, for RL Zoo 2.9, whose import of it fails beside current versions of Hugging Face's package.
-
-    :param model_name: name of the algorithm's class
-    :param env_id: the environment
-    :param mean_reward: mean return of the evaluation
-    :param std_reward: its standard deviation
-    :return: as https://huggingface.co/docs/hub/model-cards asks
+    The head of a model card: huggingface_sb3's, under the name and in the form that RL Zoo asks for. Not needed any more once
+    https://github.com/huggingface/huggingface_sb3/issues/54 is solved.
     """
-    return {
-        "library_name": "stable-baselines3",
-        "tags": [env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3-eqr"],
-        **metadata_eval_result(
-            model_pretty_name=model_name,
-            task_pretty_name="reinforcement-learning",
-            task_id="reinforcement-learning",
-            metrics_pretty_name="mean_reward",
-            metrics_id="mean_reward",
-            metrics_value=f"{mean_reward:.2f} +/- {std_reward:.2f}",
-            dataset_pretty_name=env_id,
-            dataset_id=env_id,
-        ),
-    }
+    found = importlib.import_module("huggingface_sb3.push_to_hub")._generate_metadata(*args).to_dict()
+    return found | {"tags": [*found["tags"], "sb3-eqr"]}
 
 
 def load_from_hub(repo_id: str, filename: str) -> str:
@@ -97,7 +79,8 @@ def load_from_hub(repo_id: str, filename: str) -> str:
     :param repo_id: of the repository
     :param filename: in it
     :return: where the file is after the download
-    :raises requests.HTTPError: if there is no such file: what RL Zoo 2.9 expects where normalisation is not used
+    :raises requests.HTTPError: if there is no such file: what RL Zoo 2.9 expects where normalisation is not used, and current
+        versions of huggingface_hub do not raise (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252)
     """
     try:
         return DOWNLOAD(repo_id, filename)
