@@ -18,16 +18,12 @@ SEEDS = 5  # of a benchmark where the user does not say
 
 
 def absolute(path: str) -> pathlib.Path:
-    """
-    :return: the path as every machine of a cluster understands it
-    """
+    """:return: the path as every machine of a cluster understands it"""
     return pathlib.Path(path).resolve()
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """
-    :return: of the three commands
-    """
+    """:return: of the three commands"""
     parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents, with evidence.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command goes on where it stopped")
@@ -101,10 +97,7 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    :param args: of ``run``
-    :return: exit status: 1 if a run failed
-    """
+    """:return: exit status: 1 if a run failed"""
     device = check_resources(args)
     runs = make_plan(args)
     for note in never_learn([planned.description() for planned in runs]):
@@ -123,10 +116,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """
-    :param args: of ``status``
-    :return: exit status
-    """
+    """:return: exit status"""
     runs = read_plan(args.folder)
     states = [run.state() for run in runs]
     Console().print(make_table(runs, states))
@@ -138,10 +128,7 @@ def status(args: argparse.Namespace) -> int:
 
 
 def report(args: argparse.Namespace) -> int:
-    """
-    :param args: of ``report``
-    :return: exit status
-    """
+    """:return: exit status"""
     from sb3_eqr.benchmark.report import write_report
 
     references = {}

@@ -1,4 +1,7 @@
-"""The evaluation protocol: whole episodes of a batch of environments, a fixed number of each, raw scores."""
+"""
+The evaluation protocol: whole episodes of a batch of environments, a fixed number of each, raw scores. A ``protocol`` is that
+of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`.
+"""
 
 import copy
 from typing import Any
@@ -62,18 +65,12 @@ class EpsilonGreedy:
 
 
 def preprocessing_of(protocol: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :return: that of evaluation
-    """
+    """:return: the preprocessing of evaluation"""
     return {**protocol["preprocessing"], **protocol["evaluation"]["preprocessing"]}
 
 
 def make_game(protocol: dict[str, Any]) -> gym.Env:
-    """
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :return: one environment for evaluation
-    """
+    """:return: one environment for evaluation"""
     settings = preprocessing_of(protocol)
     env = gym.make(protocol["env_id"], **(settings.get("env_kwargs") or {}))
     wrap = get_wrapper_class(settings)
@@ -84,7 +81,6 @@ def make_game(protocol: dict[str, Any]) -> gym.Env:
 
 def check_game(protocol: dict[str, Any]) -> spaces.Space:
     """
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
     :return: the action space
     :raises ValueError: if evaluation would not see whole games and raw scores
     """
@@ -103,7 +99,6 @@ def check_game(protocol: dict[str, Any]) -> spaces.Space:
 
 def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: int) -> VecEnv:
     """
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
     :param model: whose statistics normalise the observations, where it was trained so
     :param seed: of the first environment; the others count up
     """
@@ -177,8 +172,6 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     Scores and lengths of whole episodes. Every environment plays its share of them and no more, so that short episodes are
     not counted too often. Nothing of the agent changes, nor of the random generators.
 
-    :param model: the agent
-    :param protocol: see :func:`make_evaluation_env`
     :param n_episodes: number of episodes
     :param seed: of the run
     """
@@ -198,11 +191,7 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
 def play_environments(
     model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int
 ) -> tuple[list[float], list[int]]:
-    """
-    Any environments, one after the other in one process. See :func:`evaluate`.
-
-    :param seed: of the first environment
-    """
+    """As :func:`evaluate`: any environments, one after the other in one process; ``seed`` is that of the first one."""
     env = make_evaluation_env(protocol, model, seed)
     try:
         player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
@@ -214,11 +203,7 @@ def play_environments(
 
 
 def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
-    """
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :param model: the agent
-    :return: whether ``AtariBatch`` shows the agent what the protocol says
-    """
+    """:return: whether ``AtariBatch`` shows the agent what the protocol says"""
     trained = model.get_vec_normalize_env()
     return (
         protocol["env_id"].endswith("NoFrameskip-v4")
@@ -230,10 +215,8 @@ def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
 
 def play_atari(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
-    Atari by :data:`WHOLE_ATARI_GAMES`, in two batches that take turns: while the emulator plays one, the agent acts in the
-    other. See :func:`evaluate`.
-
-    :param seed: of the first game
+    As :func:`evaluate`: Atari by :data:`WHOLE_ATARI_GAMES`, in two batches that take turns. While the emulator plays one, the
+    agent acts in the other.
     """
     settings = protocol["evaluation"]
     n_envs = min(settings["n_envs"], n_episodes)

@@ -1,0 +1,129 @@
+"""
+What the latent state of an agent knows of the objects in a game: the share of variance (R²) of their places that a linear
+probe explains, on frames that the probe has not seen. Beside it the trunk's features, and the same of a new agent. MinAtar's
+objects stand in its planes, those of Atari in the console's memory.
+
+    python -m benchmarks.probes --game Breakout --steps 10000 --seeds 0 1
+    python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
+    python -m benchmarks.probes --game ALE/Pong --steps 0
+"""
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.trials import merged
+from sb3_eqr import EqRRainbow, envs
+from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from sb3_eqr.visualize.latents import encode
+
+# MinAtar's planes (Young and Tian 2019); the mean place of what is drawn in one, and how much of it there is.
+PLANES = {
+    "Breakout": ["paddle", "ball", "trail", "bricks"],
+    "SpaceInvaders": ["cannon", "aliens", "aliens left", "aliens right", "own bullet", "their bullet"],
+}
+# Addresses in the memory of the console (Anand et al. 2019, https://arxiv.org/abs/1906.08226, table of their annotations).
+MEMORY = {
+    "ALE/Pong": {"own paddle: y": 51, "their paddle: y": 50, "ball: x": 49, "ball: y": 54},
+    "ALE/Boxing": {"own: x": 32, "own: y": 34, "their: x": 33, "their: y": 35},
+    "ALE/Breakout": {"paddle: x": 72, "ball: x": 99, "ball: y": 101},
+}
+N_FRAMES, TRAINED_ON, RIDGE = 6_000, 4_500, 100.0
+
+
+def targets(planes: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
+    """
+    :param planes: (N, channels, 10, 10), 0 or 255
+    :return: name -> (N,), what varies of row, column and count of each plane; NaN where it is empty
+    """
+    found: dict[str, np.ndarray] = {}
+    lit = planes > 0
+    for channel, name in enumerate(names):
+        count = lit[:, channel].sum(axis=(1, 2))
+        rows, columns = (lit[:, channel].any(axis=axis) for axis in (2, 1))
+        for what, line in (("row", rows), ("column", columns)):
+            places = np.arange(10)
+            with np.errstate(invalid="ignore"):
+                found[f"{name}: {what}"] = (line * places).sum(axis=1) / line.sum(axis=1)
+        found[f"{name}: number"] = count.astype(float)
+    return {name: value for name, value in found.items() if np.nanstd(value) > 1e-6}
+
+
+def explained(inputs: np.ndarray, target: np.ndarray) -> float:
+    """R² of ridge regression on frames that it was not fitted to; of frames where there is something."""
+    known = ~np.isnan(target)
+    inputs, target = inputs[known], target[known]
+    cut = int(len(target) * TRAINED_ON / N_FRAMES)
+    mean, scale = inputs[:cut].mean(axis=0), inputs[:cut].std(axis=0) + 1e-6
+    x, y = (inputs - mean) / scale, target - target[:cut].mean()
+    weights = np.linalg.solve(x[:cut].T @ x[:cut] + RIDGE * np.eye(x.shape[1]), x[:cut].T @ y[:cut])
+    left = y[cut:] - x[cut:] @ weights
+    return float(1 - left.var() / max(y[cut:].var(), 1e-9))
+
+
+def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+    """
+    :return: what is probed -> object -> R², of frames of the agent's own play, a third of its actions random
+    """
+    obs, frames, memory = env.reset(), [], []
+    for _ in range(N_FRAMES):
+        frames.append(obs[0].copy())
+        if game in MEMORY:
+            memory.append(env.envs[0].unwrapped.ale.getRAM())
+        action, _ = model.predict(obs, deterministic=True)
+        action = rng.integers(0, env.action_space.n, 1) if rng.random() < 0.3 else action
+        obs, *_ = env.step(action)
+    seen = np.stack(frames)
+    order = rng.permutation(N_FRAMES)  # neighbours on both sides of the cut: the probe has seen the like
+    with th.no_grad():
+        features = np.concatenate([model.policy.online.features(part).numpy() for part in th.as_tensor(seen).split(250)])
+    inputs = {"trunk": features, "state": encode(model, th.as_tensor(seen)).cpu().numpy()}
+    if game in MEMORY:
+        known = {name: np.stack(memory)[:, address].astype(float) for name, address in MEMORY[game].items()}
+    else:
+        known = targets(seen, PLANES[game])
+    return {what: {name: explained(x[order], y[order]) for name, y in known.items()} for what, x in inputs.items()}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--game", choices=[*PLANES, *MEMORY], default="Breakout")
+    parser.add_argument("--agent", default="eqr_rainbow", help="a file of zoo_hyperparams")
+    parser.add_argument("--changes", type=yaml.safe_load, default={}, help="of its entry, as YAML")
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    envs.register()
+    is_atari = args.game in MEMORY
+    env_id = "atari" if is_atari else f"MinAtar/{args.game}-v1"
+    entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
+    settings = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, args.changes)
+    settings["buffer_size"] = max(args.steps, 100)
+    for seed in args.seeds:
+        if is_atari:
+            env = envs.make_atari100k_env(args.game.removeprefix("ALE/"), n_envs=1, seed=seed)
+        else:
+            env = make_vec_env(env_id, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
+        model = EqRRainbow("CnnPolicy", env, seed=seed, device="cpu", **settings)
+        env = model.get_env()
+        found = {"new": probe(model, env, args.game, np.random.default_rng(seed))}
+        if args.steps:
+            model.learn(args.steps)
+            found["trained"] = probe(model, env, args.game, np.random.default_rng(seed))
+        columns = [(when, what) for when in found for what in ("trunk", "state")]
+        print(f"| seed {seed} | {' | '.join(f'{when}, {what}' for when, what in columns)} |")
+        print("|---|" + "---|" * len(columns))
+        for name in found["new"]["state"]:
+            print(f"| {name} | " + " | ".join(f"{found[when][what].get(name, np.nan):.2f}" for when, what in columns) + " |")
+        print(json.dumps(args.changes), flush=True)
+
+
+if __name__ == "__main__":
+    main()
