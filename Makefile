@@ -7,7 +7,7 @@ CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
 
-.PHONY: demo quick test pytest slow format lint type commit-checks doc clean
+.PHONY: demo quick test pytest slow format lint type commit-checks doc dist clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -45,6 +45,17 @@ commit-checks: format lint type
 
 doc: $(VENV)/installed
 	$(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
+
+# A release: what a wheel and a source archive hold, and whether the wheel works in an environment that has nothing else.
+dist: $(VENV)/installed
+	rm -rf dist
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+	$(PYTHON) -m venv dist/venv
+	dist/venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	cd dist && venv/bin/python -c "from sb3_eqr import EqRQRDQN; EqRQRDQN('MlpPolicy', 'CartPole-v1', learning_starts=50).learn(100)"
+	@echo "Then: CHANGELOG.md has the version, make slow passes, docs/results are of this version, tag it."
 
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

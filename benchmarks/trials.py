@@ -91,7 +91,11 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     goals = {}
     if game in WORLDS:
         returns = [value for one in env.env_method("get_episode_rewards") for value in one]
+        lengths = [value for one in env.env_method("get_episode_lengths") for value in one]
+        paid = np.flatnonzero(np.array(returns) > 0)
         goals = {"return_in_all": round(float(np.sum(returns)), 3), "episodes": len(returns)}
+        if len(paid):  # where returns are rewards: how long it took to find the first one, and what came of it
+            goals["first_reward_at"] = int(np.cumsum(lengths)[paid[0]])
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
