@@ -15,7 +15,7 @@ def main() -> None:
             del sys.argv[1]
         run = importlib.import_module(f"sb3_eqr.{extra}.__main__").main
     except ImportError as error:
-        advice = "" if "pip install" in str(error) else f'. pip install "sb3-eqr[{extra}]" brings it'
+        advice = "" if "pip install" in str(error) else f'. pip install ".[{extra}]" in a clone of the repository brings it'
         others = (
             "" if extra in COMMANDS else ". Without it there are: " + ", ".join(f"sb3-eqr {name} --help" for name in COMMANDS)
         )

@@ -208,7 +208,7 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
-                f'{nearest(env_id, gym.registry)} For Atari: pip install "sb3-eqr[atari]".'
+                f'{nearest(env_id, gym.registry)} For Atari: pip install ".[atari]" in a clone of the repository.'
             )
     return suite.model_copy(update={"games": kept, "steps": per_game})
 

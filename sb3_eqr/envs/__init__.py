@@ -1,4 +1,7 @@
-"""Environments. Importing this needs no extra; making an Atari environment needs ``pip install sb3-eqr[atari]``."""
+"""
+Environments. Importing this needs no extra; making an Atari environment needs ``pip install ".[atari]"`` in a clone of the
+repository.
+"""
 
 from typing import Any
 

@@ -110,7 +110,7 @@ def atari_env_id(game: str) -> str:
     try:
         import ale_py
     except ImportError as error:
-        raise ImportError('Atari needs ale-py and OpenCV: pip install "sb3-eqr[atari]"') from error
+        raise ImportError('Atari needs ale-py and OpenCV: pip install ".[atari]" in a clone of the repository') from error
     gym.register_envs(ale_py)
     games = {name[4:-3].lower(): name for name in gym.registry if re.fullmatch(r"ALE/[A-Za-z]+[A-Za-z0-9]*-v5", name)}
     bare = re.sub(r"^ALE/|-v5$|NoFrameskip-v4$|[_ ]", "", game)

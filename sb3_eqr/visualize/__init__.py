@@ -1,6 +1,7 @@
 """
 Seeing what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes numbers and pictures (docs/visualize.md), ``diagnose``
-gives the numbers, ``LatentCallback`` logs them in training, ``record`` films it. Needs ``pip install sb3-eqr[visualize]``.
+gives the numbers, ``LatentCallback`` logs them in training, ``record`` films it. Needs ``pip install ".[visualize]"``
+in a clone of the repository.
 """
 
 import importlib

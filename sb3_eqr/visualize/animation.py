@@ -195,7 +195,7 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
     try:
         import imageio.v2 as imageio
     except ImportError as error:
-        raise ImportError('A video needs imageio and ffmpeg: pip install "sb3-eqr[visualize]"') from error
+        raise ImportError('Videos need imageio, ffmpeg: pip install ".[visualize]" in a clone of the repository') from error
     paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
     with tempfile.TemporaryDirectory() as folder:
         aside = {suffix: pathlib.Path(folder) / f"film.{suffix}" for suffix in formats}

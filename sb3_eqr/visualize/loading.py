@@ -141,7 +141,8 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
     try:
         from rl_zoo3.utils import create_test_env, get_saved_hyperparams
     except ImportError as error:
-        raise ImportError(f'{folder} is of RL Zoo, which is not installed ({error}): pip install "sb3-eqr[zoo]"') from error
+        advice = 'pip install ".[zoo]" in a clone of the repository'
+        raise ImportError(f"{folder} is of RL Zoo, which is not installed ({error}): {advice}") from error
     arguments = zoo_arguments(folder)
     for package in arguments.get("gym_packages") or []:
         importlib.import_module(package)

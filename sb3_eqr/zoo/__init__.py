@@ -10,7 +10,7 @@ hyperparameter files, and messages instead of tracebacks for wrong use.
 try:
     import rl_zoo3.import_envs  # noqa: F401
 except ImportError as error:
-    raise ImportError(f'sb3_eqr.zoo needs RL Zoo, found: {error}. pip install "sb3-eqr[zoo]"') from None
+    raise ImportError(f'sb3_eqr.zoo needs RL Zoo, found: {error}. pip install ".[zoo]" in a clone of the repository') from None
 
 from sb3_eqr import AGENTS
 from sb3_eqr.zoo.registration import register

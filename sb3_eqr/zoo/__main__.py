@@ -205,7 +205,9 @@ def run(command: str, arguments: list[str]) -> None:
             module, function = FUNCTIONS[command].split(":")
             getattr(importlib.import_module(module), function)()
     except ModuleNotFoundError as error:
-        advice = ' pip install "sb3-eqr[zoo]" brings it.' if str(error.name).split(".")[0] in EXTRA else ""
+        advice = (
+            ' pip install ".[zoo]" in a clone of the repository brings it.' if str(error.name).split(".")[0] in EXTRA else ""
+        )
         fail(f"{command}: {error}.{advice}")
     except gym.error.DependencyNotInstalled as error:
         fail(str(error))

@@ -14,7 +14,7 @@ from rl_zoo3.utils import ALGOS
 
 # The start of an environment's name, and what it needs.
 EXTRAS = {
-    "ALE/": ("ale_py", '"sb3-eqr[atari]"'),
+    "ALE/": ("ale_py", '".[atari]" in a clone of the repository'),
     "MinAtar/": ("minatar", "minatar"),
 }
 

@@ -13,7 +13,7 @@ import requests
 
 DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {
-    "pip install rl_zoo3": 'pip install "sb3-eqr[atari,zoo]"',
+    "pip install rl_zoo3": 'pip install ".[atari,zoo]"  # in a clone of the repository of sb3-eqr',
     "python -m rl_zoo3.": "sb3-eqr ",
 }
 

@@ -215,14 +215,16 @@ def test_other_settings_do_not_go_into_the_same_folder(files):
 def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     code, out = sb3_eqr(RUN)
-    assert code == 2 and 'benchmark run needs Ray: pip install "sb3-eqr[benchmark]"' in out.err
+    assert code == 2 and 'benchmark run needs Ray: pip install ".[benchmark]" in a clone of the repository' in out.err
 
 
 def test_the_script_without_its_extra(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", "status", "b"])
     monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.__main__", raising=False)
     monkeypatch.setitem(sys.modules, "rich.console", None)
-    with pytest.raises(SystemExit, match=r'sb3-eqr: .*rich.*pip install "sb3-eqr\[benchmark\]" brings it'):
+    with pytest.raises(
+        SystemExit, match=r'sb3-eqr: .*rich.*pip install "\.\[benchmark\]" in a clone of the repository brings it'
+    ):
         cli.main()
 
 

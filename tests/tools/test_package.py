@@ -45,7 +45,7 @@ def test_importing_needs_no_extra():
 
 def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ale_py", None)
-    with pytest.raises(ImportError, match=re.escape('pip install "sb3-eqr[atari]"')):
+    with pytest.raises(ImportError, match=re.escape('pip install ".[atari]" in a clone of the repository')):
         make_atari100k_env("Pong")
 
 

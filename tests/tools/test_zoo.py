@@ -88,7 +88,11 @@ def test_a_gpu_that_is_not_there(sb3_eqr, capfd):
         ("wandb", "train --algo eqr_qrdqn --track", "pip install wandb"),
         ("tensorboard", "train --algo eqr_qrdqn -tb tb", "pip install tensorboard"),
         ("minatar", "train --algo eqr_qrdqn --env MinAtar/Breakout-v1", "pip install minatar"),
-        ("ale_py", "train --algo eqr_qrdqn --env PongNoFrameskip-v4", r'pip install "sb3-eqr\[atari\]"'),
+        (
+            "ale_py",
+            "train --algo eqr_qrdqn --env PongNoFrameskip-v4",
+            r'pip install "\.\[atari\]" in a clone of the repository',
+        ),
     ],
 )
 def test_missing_extras_are_named(sb3_eqr, capfd, monkeypatch, package, line, advice):
@@ -381,7 +385,7 @@ def test_the_script_without_rl_zoo(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("sb3_eqr.zoo")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rl_zoo3.import_envs", None)
-    with pytest.raises(SystemExit, match=r'sb3-eqr: .*pip install "sb3-eqr\[zoo\]"'):
+    with pytest.raises(SystemExit, match=r'sb3-eqr: .*pip install "\.\[zoo\]" in a clone of the repository'):
         cli.main()
 
 
