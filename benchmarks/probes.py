@@ -112,7 +112,7 @@ def main() -> None:
         else:
             env = make_vec_env(env_id, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
         model = EqRRainbow("CnnPolicy", env, seed=seed, device="cpu", **settings)
-        env = model.get_env()
+        env = model.get_env() or env  # channels first
         found = {"new": probe(model, env, args.game, np.random.default_rng(seed))}
         if args.steps:
             model.learn(args.steps)
