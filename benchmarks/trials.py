@@ -159,6 +159,26 @@ def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps:
     return "\n".join(lines)
 
 
+def world_table(rows: list[dict[str, Any]], names: list[str], game: str, steps: int) -> str:
+    """
+    Markdown, a row per trial in a world that pays 1 for its goal: how often it was reached in training, when first (the median
+    over seeds), how many steps an episode took from then on, and how often the greedy policy reaches it.
+    """
+    lines = ["| trial | seeds | goals reached | first one at step | steps per goal from there on | greedy policy |"]
+    lines.append("|---" * 6 + "|")
+    for name in names:
+        own = [row for row in rows if (row["trial"], row["game"], row["steps"]) == (name, game, steps)]
+        first = [row.get("first_reward_at", steps) for row in own]
+        found = [row for row in own if row["return_in_all"] > 1]
+        pace = [(steps - row["first_reward_at"]) / (row["return_in_all"] - 1) for row in found]
+        cells = [mean_and_error([row[key] for row in own]) for key in ("return_in_all", "score")]
+        if own:
+            lines.append(
+                f"| {name} | {len(own)} | {cells[0]} | {np.median(first):.0f} | {mean_and_error(pace)} | {cells[1]} |"
+            )
+    return "\n".join(lines)
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -193,7 +213,11 @@ def main() -> None:
 
         with ThreadPoolExecutor(arguments.jobs) as pool:
             list(pool.map(start, left))
-    print(table(read_rows(arguments.rows), names, arguments.games, arguments.steps))
+    rows = read_rows(arguments.rows)
+    print(table(rows, names, arguments.games, arguments.steps))
+    for game in arguments.games:
+        if "torus" in game:
+            print(f"\n{game}\n", world_table(rows, names, game, arguments.steps), sep="\n")
 
 
 if __name__ == "__main__":

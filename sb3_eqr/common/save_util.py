@@ -128,6 +128,10 @@ class SafeFiles(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # made by _setup_model
 
+    def _make_replay_buffer(self) -> ReplayBuffer:
+        """An empty one, as the arguments say."""
+        raise NotImplementedError
+
     def _before_saving(self) -> None:
         """Called before a model is written; an exception keeps the old file."""
 
@@ -234,8 +238,9 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is truncated or changed, needs ``trust``, or holds a buffer of another kind or
             algorithm, or for other spaces or environments; the model then keeps the buffer it had
         """
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
         before = self.replay_buffer
-        assert before is not None
         loaded, notes = self._read_replay_buffer(path, trust)
         expected = {"algorithm": type(self).__name__, **_describe(before)}
         found = {"algorithm": type(self).__name__, **notes, **_describe(loaded)}
@@ -247,7 +252,7 @@ class SafeFiles(OffPolicyAlgorithm):
                 f"{path}: this replay buffer was saved at step {steps}, and the model is of step {self.num_timesteps}. "
                 "Load files that were saved together."
             )
-        loaded.device = before.device
+        loaded.device = self.device
         self.replay_buffer = loaded
 
     def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:

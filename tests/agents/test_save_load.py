@@ -302,6 +302,14 @@ def test_a_flipped_byte_anywhere_is_seen(make, tmp_path):
     assert model.replay_buffer is buffer
 
 
+def test_a_buffer_is_loaded_where_there_is_none(make, tmp_path):
+    model = make(ChainEnv()).learn(46)
+    model.save_replay_buffer(tmp_path / "buffer")
+    rewards, model.replay_buffer = model.replay_buffer.rewards.copy(), None
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert (model.replay_buffer.rewards == rewards).all()
+
+
 def test_a_buffer_of_another_step_is_warned_of(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")

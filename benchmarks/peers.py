@@ -1,0 +1,107 @@
+"""
+The tests of SB3 and sb3-contrib, of the versions that are installed, with our agents in the places of theirs: EqRQRDQN in that
+of QRDQN, EqRRainbow in that of DQN. Their source archives are fetched from the package index. Exits with 1 if a test fails for
+which no reason stands here.
+
+    python -m benchmarks.peers --out docs/results/peers.md
+"""
+
+import argparse
+import importlib.metadata
+import pathlib
+import subprocess
+import sys
+import tarfile
+import tempfile
+import xml.etree.ElementTree as ET
+
+SUITES = {"sb3-contrib": ("EqRQRDQN", "sb3_contrib.QRDQN"), "stable-baselines3": ("EqRRainbow", "stable_baselines3.DQN")}
+COPIED = (
+    "it expects a target network that differs from the online one; the defaults copy it after every update, as the paper does"
+)
+BUFFER = "it looks at the arrays of SB3's own replay buffer; ours holds each frame once"
+COUNTER = "it fills all tensors with random numbers; those of batch norm in the latent networks count batches, as integers"
+TRUNK = "it looks for a layer of a custom features extractor, which sits at features_extractor.trunk"
+HER = "hindsight replay has a buffer of its own, without the sequences that the losses need"
+REASONS = {  # a module of tests, or a test without its parameters
+    "test_her": HER,
+    "test_n_step_replay": "it expects SB3's own buffer for n-step returns",
+    "test_feature_extractor_target_net": COPIED,
+    "test_features_extractor_target_net": COPIED,
+    "test_image_like_input": "it expects an AssertionError for float images; ours is a ValueError that says what to pass",
+    "test_consistency": "MlpPolicy has a dense layer in front that MultiInputPolicy has not",
+    "test_save_load_replay_buffer": BUFFER,
+    "test_save_load": COUNTER,
+    "test_save_load_policy": COUNTER,
+    "test_offpolicy_collect_rollout_batch_norm": TRUNK,
+    "test_predict_with_dropout_batch_norm": TRUNK,
+    "test_fps_logger": "it expects 100 steps a second, two updates a step included",
+    "test_offpolicy_multi_env": "it expects updates after 3 steps; a window of 10 steps is not complete by then",
+    "test_warn_buffer": "it expects a warning that trajectories are cut off; ours are not",
+}
+
+
+def fetch(package: str, folder: pathlib.Path) -> pathlib.Path:
+    """:return: the unpacked source archive of the version that is installed"""
+    wanted = f"{package}=={importlib.metadata.version(package)}"
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-binary", ":all:", "--dest", str(folder)]
+    subprocess.run([sys.executable, "-m", "pip", "download", *options, wanted], check=True)
+    (archive,) = folder.glob(f"{package.replace('-', '_')}-*.tar.gz")
+    with tarfile.open(archive) as content:
+        content.extractall(folder, filter="data")
+    return folder / archive.name.removesuffix(".tar.gz")
+
+
+def run(package: str, folder: pathlib.Path) -> dict[str, list[str]]:
+    """:return: "passed", "failed" and "skipped" -> names of tests"""
+    agent, place = SUITES[package]
+    module, name = place.split(".")
+    (folder / "swap.py").write_text(f"import {module}\nfrom sb3_eqr import {agent}\n\n{module}.{name} = {agent}\n")
+    report = folder / f"{package}.xml"
+    command = [sys.executable, "-m", "pytest", "-p", "swap", "tests", "-k", agent, "-q", f"--junitxml={report}"]
+    environment = {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(folder)}
+    subprocess.run(command, cwd=fetch(package, folder), env=environment, stdout=subprocess.DEVNULL)
+    found: dict[str, list[str]] = {"passed": [], "failed": [], "skipped": []}
+    for case in ET.parse(report).iter("testcase"):
+        kinds = {child.tag for child in case}
+        outcome = "skipped" if "skipped" in kinds else "failed" if kinds & {"failure", "error"} else "passed"
+        found[outcome].append(f"{case.get('classname', '').removeprefix('tests.')}: {case.get('name')}")
+    return found
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=pathlib.Path, help="a Markdown page")
+    args = parser.parse_args()
+    lines = ["# The peers' own tests", "", " ".join(__doc__.split("\n\n")[0].split()), "", "```sh"]
+    lines += [
+        "python -m benchmarks.peers --out docs/results/peers.md",
+        "```",
+        "",
+        "| suite | agent | passed | skipped | failed |",
+    ]
+    lines.append("|---|---|---|---|---|")
+    failed: list[str] = []
+    for package, (agent, _) in SUITES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            found = run(package, pathlib.Path(folder))
+        counts = " | ".join(str(len(found[outcome])) for outcome in ("passed", "skipped", "failed"))
+        lines.append(f"| {package} {importlib.metadata.version(package)} | {agent} | {counts} |")
+        failed += found["failed"]
+    lines += ["", "Those that fail, and why:", ""]
+    unexplained = []
+    for test in failed:
+        module, _, name = test.partition(": ")
+        reason = REASONS.get(module) or REASONS.get(name.partition("[")[0])
+        unexplained += [] if reason else [test]
+        lines.append(f"- `{test}`: {reason or '**no reason is known**'}.")
+    text = "\n".join([*lines, ""])
+    print(text)
+    if args.out is not None:
+        args.out.write_text(text, encoding="utf-8")
+    raise SystemExit(1 if unexplained else 0)
+
+
+if __name__ == "__main__":
+    main()
