@@ -169,7 +169,7 @@ def world_table(rows: list[dict[str, Any]], names: list[str], game: str, steps: 
     for name in names:
         own = [row for row in rows if (row["trial"], row["game"], row["steps"]) == (name, game, steps)]
         first = [row.get("first_reward_at", steps) for row in own]
-        found = [row for row in own if row["return_in_all"] > 1]
+        found = [row for row in own if row["return_in_all"] > 1 and "first_reward_at" in row]
         pace = [(steps - row["first_reward_at"]) / (row["return_in_all"] - 1) for row in found]
         cells = [mean_and_error([row[key] for row in own]) for key in ("return_in_all", "score")]
         if own:
