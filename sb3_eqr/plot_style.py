@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import matplotlib
 
-# Okabe and Ito's colours (https://jfly.uni-koeln.de/color), told apart by the colour-blind, too.
+# Okabe and Ito's colours (https://jfly.uni-koeln.de/color), which the colour-blind distinguish, too.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#000000", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (8, 2, 1, 2, 1, 2)), (0, (3, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")

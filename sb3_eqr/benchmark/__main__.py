@@ -26,7 +26,7 @@ def make_parser() -> argparse.ArgumentParser:
     """:return: of the three commands"""
     parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents, with evidence.")
     commands = parser.add_subparsers(dest="command", required=True)
-    run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command goes on where it stopped")
+    run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command resumes where it stopped")
     run.add_argument("folder", type=absolute, help="where everything is written")
     run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, or one of --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
@@ -84,10 +84,10 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
         for name in ("suite_file", "games", "seeds", "steps"):
             if getattr(args, name) is not None:
                 flag = f"--{name.replace('_', '-')}"
-                raise ValueError(f"{flag}: expected --suite and --agents with it; FOLDER alone goes on as it is")
+                raise ValueError(f"{flag}: expected --suite and --agents with it; FOLDER alone resumes what it holds")
         return read_plan(args.folder)
     if args.suite is None or args.agents is None:
-        raise ValueError("expected both --suite and --agents, or neither to go on with what the folder holds")
+        raise ValueError("expected both --suite and --agents, or neither to resume what the folder holds")
     if args.steps is not None and args.steps < 1:
         raise ValueError(f"--steps: expected at least 1, found {args.steps}")
     suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
@@ -152,7 +152,7 @@ def main() -> None:
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:
-        fail("stopped. The same command goes on, from the last checkpoints where there are any.")
+        fail("stopped. The same command resumes, from the last checkpoints where there are any.")
 
 
 if __name__ == "__main__":

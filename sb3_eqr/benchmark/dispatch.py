@@ -54,8 +54,8 @@ def run_benchmark(
     console: Console | None = None,
 ) -> list[Run]:
     """
-    Finish all runs: those that are finished are skipped, broken ones go on from their last checkpoint, those that another
-    process has are waited for, one that crashes twice is left while the others go on.
+    Finish all runs: those that are finished are skipped, interrupted ones resume from their last checkpoint, those that
+    another process has are waited for, one that crashes twice is left while the others continue.
 
     :param runs: of the benchmark
     :param settings: of all runs

@@ -144,7 +144,7 @@ class GamesInTurn:
         return bool(self._left.any())
 
     def act(self) -> None:
-        """Choose actions and let the emulator go on with them; it does so while Python goes on, too."""
+        """Choose actions and send them to the emulator, which plays while Python does other work."""
         # No thoughts on games that have had their share, but a recurrent agent keeps a state for each.
         chosen = np.flatnonzero(self._left) if self._state is None else np.arange(self._batch.n_envs)
         actions = np.zeros(self._batch.n_envs, dtype=int)

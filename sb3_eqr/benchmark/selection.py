@@ -83,7 +83,7 @@ def choose_runs(
 
     :param results: of all finished runs
     :param suite_games: all games, in order
-    :param force: go on with the games in common where some agent lacks others
+    :param force: continue with the games in common where some agent lacks others
     :return: games, agent -> seeds, sentences on what is left out
     :raises ValueError: if scores are missing for some games, or no game, or no seed of an agent, is left
     """

@@ -168,7 +168,7 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
     How far apart the IQMs of two agents must lie for their runs to show it: half the width of the 95 % interval around a
     difference of 0. Its variances are those that the bootstrap finds, times n / (n - 1), which a bootstrap of n runs is short
     of, and its quantile is Student's, with games (n₁ + n₂ - 2) degrees of freedom: without these two, agents that are alike
-    would be told apart by 2 runs on 3 games in a fifth of all cases.
+    would be distinguished by 2 runs on 3 games in a fifth of all cases.
 
     :param first: (runs, games), normalised scores
     :param second: as well; the number of runs may differ

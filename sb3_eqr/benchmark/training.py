@@ -262,7 +262,7 @@ def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, 
 
 
 def train(run: Run, settings: Settings) -> None:
-    """Train, evaluate, write ``result.json``; what was begun before goes on from its last checkpoint."""
+    """Train, evaluate, write ``result.json``; what was begun before resumes from its last checkpoint."""
     started = time.monotonic()
     envs.register()
     register()

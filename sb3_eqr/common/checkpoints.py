@@ -64,7 +64,7 @@ def write_checkpoint(
 
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
-    """The arguments of an agent that are plain values, by which its run is told from another one."""
+    """The arguments of an agent that are plain values, by which its run is distinguished from another one."""
     found = {name: getattr(model, name, None) for name in ALGORITHM if name not in ("verbose", "tensorboard_log")}
     return {name: value for name, value in found.items() if isinstance(value, (bool, int, float, str))}
 

@@ -43,7 +43,7 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
 
 def branch(features: th.Tensor, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Features for the TD loss and for the auxiliary losses: the same numbers, but the gradients of both are told apart where
+    Features for the TD loss and for the auxiliary losses: the same numbers, but the gradients of both are kept apart where
     they meet, and the auxiliary one is scaled there so that its norm is at most a share of the TD loss's.
 
     :param features: (B, F)

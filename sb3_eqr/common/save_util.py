@@ -32,7 +32,7 @@ def is_whole_model(path: pathlib.Path) -> bool:
     """
     :param path: an existing file
     :return: whether it is a zip file with everything that SB3's ``save`` puts in, unchanged. The parts of a model are zip
-        files themselves, so one that was cut off may still look like a zip file.
+        files themselves, so a truncated one may still look like a zip file.
     """
     try:
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
@@ -166,7 +166,7 @@ class SafeFiles(OffPolicyAlgorithm):
             found = find_file(path)
             if found is not None and not is_whole_model(found):
                 raise ValueError(
-                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is cut off, damaged or "
+                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is truncated, damaged or "
                     "something else. Load an earlier checkpoint."
                 )
         given = custom_objects or {}

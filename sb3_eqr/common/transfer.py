@@ -61,7 +61,7 @@ def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device
         found_file = find_file(path)
         if found_file is not None and not is_whole_model(found_file):
             raise ValueError(
-                f"load_representation: expected a whole file of an agent's save, found one that is cut off: {path}."
+                f"load_representation: expected a whole file of an agent's save, found one that is truncated: {path}."
             )
     _, saved, _ = load_from_zip_file(path, load_data=False, device=device)  # type: ignore[arg-type]
     parameters: Any = (saved or {}).get("policy", {})

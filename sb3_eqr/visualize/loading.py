@@ -32,7 +32,7 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
     if not path.is_file():
         raise ValueError(f"MODEL: expected the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, found {str(path)!r}")
     if not is_whole_model(path):
-        raise ValueError(f"{path}: expected a whole file of an agent's save, found one that is cut off or something else")
+        raise ValueError(f"{path}: expected a whole file of an agent's save, found one that is truncated or something else")
     try:
         return AGENTS[algo or find_algorithm(path)].load(path, device=device, trust=trust)
     except (TypeError, RuntimeError) as error:

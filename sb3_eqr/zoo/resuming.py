@@ -29,7 +29,7 @@ class ResumableExperiment(ExperimentManager):
         self.continue_training = self.continue_training or self.resume is not None
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """RL Zoo's; what cannot be built is told without a traceback."""
+        """RL Zoo's; what cannot be built gets a message instead of a traceback."""
         try:
             return super().setup_experiment()
         except (ValueError, TypeError, IndexError, ImportError) as error:

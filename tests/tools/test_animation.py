@@ -1,4 +1,4 @@
-"""Videos of latent states, and the callback that logs them: what is drawn, told apart from the drawing."""
+"""Videos of latent states, and the callback that logs them: what is drawn, apart from the drawing."""
 
 import gymnasium as gym
 import imageio.v2 as imageio

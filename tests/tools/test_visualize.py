@@ -327,7 +327,7 @@ def saved(tmp_path_factory):
     [
         ("", "the following arguments are required: MODEL"),
         ("nothing.zip", "MODEL: expected the path of a .zip file, such as .*, found 'nothing.zip'"),
-        ("{cut}", "expected a whole file of an agent's save, found one that is cut off"),
+        ("{cut}", "expected a whole file of an agent's save, found one that is truncated"),
         ("{model}", r"--env: expected the environment of the agent, .* \(args.yml\) beside"),
         ("{model} --env Rnig-v0", "'Rnig-v0' is not registered with gymnasium. Did you mean 'Ring-v0'?"),
         ("{model} --env CartPole-v1", "the environment is not the agent's. Observation spaces do not match"),

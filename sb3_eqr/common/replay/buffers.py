@@ -39,7 +39,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param device: where samples go
     :param n_envs: number of parallel environments
     :param optimize_memory_usage: ignored: memory is always saved
-    :param handle_timeout_termination: whether a time-out (``TimeLimit.truncated``) is told from a terminal state
+    :param handle_timeout_termination: whether a time-out (``TimeLimit.truncated``) is distinguished from a terminal state
     :param n_steps: n ≥ 1
     :param gamma: γ in [0, 1]
     :param prediction_depth: M ≥ 0
