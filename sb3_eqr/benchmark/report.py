@@ -93,7 +93,7 @@ def write_report(
 
 
 def _html(table: Table, kind: str = "numbers") -> Markup:
-    return Markup(to_html(table, kind))  # noqa: S704: its cells are escaped
+    return Markup(to_html(table, kind))  # its cells are escaped
 
 
 def _lead(comparison: Comparison) -> str:

@@ -267,7 +267,7 @@ def train(run: Run, settings: Settings) -> None:
     envs.register()
     register()
     with open(run.folder / STARTS, "a", encoding="utf-8") as file:
-        file.write(datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds") + "\n")
+        file.write(datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds") + "\n")
     model, callbacks = build(run, settings.device)
     record = new_record()
     found = find_checkpoints(run.folder)
