@@ -100,7 +100,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         """
         Default hyperparameters are those of the paper for Atari 100K (Table 5: sums over 5 steps there, means here).
 
-        :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+        :param policy: The policy model to use, by its name ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") or its class
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
         :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
         :param buffer_size: size of the replay buffer, over all environments; per environment at least n + M + 1
@@ -115,7 +115,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation: ``alpha``, ``beta`` and
             ``final_beta`` of :class:`~sb3_eqr.common.replay.buffers.PrioritizedSequenceReplayBuffer`; ``frame_stack``, how
             many frames an image observation stacks (found where ``VecFrameStack`` is used)
-        :param optimize_memory_usage: has no effect: memory is always saved
+        :param optimize_memory_usage: has no effect, with a warning: each frame is stored once in any case
         :param n_steps: n of the n-step return
         :param target_update_interval: environment steps between two target updates, as in QRDQN; ``None``: each gradient step
         :param exploration_fraction: fraction of training over which the exploration rate falls; then noisy layers explore
@@ -153,6 +153,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         check_arguments(locals(), ALGORITHM)
         check_arguments(policy_kwargs or {}, POLICY)
         validation.check_device(device)
+        if optimize_memory_usage:
+            warnings.warn("optimize_memory_usage=True has no effect: the replay buffer stores each frame once in any case.")
         policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
         set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]

@@ -402,3 +402,8 @@ def test_arguments_of_the_policy_are_sent_there():
     for kind, name in ((EqRRainbow, "v_min"), (EqRQRDQN, "n_quantiles"), (EqRRainbow, "layer_norm")):
         with pytest.raises(TypeError, match=rf"unexpected argument '{name}'. Pass policy_kwargs=dict\({name}=...\)"):
             kind("MlpPolicy", ChainEnv(), **{name: 1})
+
+
+def test_an_argument_without_effect_warns():
+    with pytest.warns(UserWarning, match="optimize_memory_usage=True has no effect"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, optimize_memory_usage=True, policy_kwargs=SMALL)

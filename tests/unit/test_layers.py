@@ -4,7 +4,7 @@ import torch as th
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
-from sb3_eqr.common.networks.encoders import ConvTrunk
+from sb3_eqr.common.networks.encoders import ConvTrunk, GroupLayer
 from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening, draw_noise
 
 
@@ -159,3 +159,8 @@ def test_whitening_is_finite_where_features_are_alike_or_more_than_samples():
 def test_whitening_has_the_gradient_of_what_it_computes():
     th.manual_seed(1)
     assert th.autograd.gradcheck(Whitening(3).double(), th.randn(5, 3, dtype=th.float64, requires_grad=True))
+
+
+def test_layers_print_their_sizes():
+    assert repr(NoisyLinear(3, 5)) == "NoisyLinear(in_features=3, out_features=5)"
+    assert "SE(2), n_blocks=4, state_dim=24" in repr(GroupLayer(7, "SE(2)", n_blocks=4))

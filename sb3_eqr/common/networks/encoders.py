@@ -305,6 +305,10 @@ class GroupLayer(nn.Module):
         if whiten:
             self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
 
+    def extra_repr(self) -> str:
+        """Group, blocks and size of a state."""
+        return f"{self.group}, n_blocks={self.n_blocks}, state_dim={self.state_dim}"
+
     def forward(self, features: th.Tensor) -> th.Tensor:
         """Features, (B, F), to K flattened elements, (B, D)."""
         params = self.to_algebra(features)  # (B, K * num_params)

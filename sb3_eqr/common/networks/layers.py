@@ -49,6 +49,10 @@ class NoisyLinear(nn.Module):
             return th.addcmul(F.linear(inputs, self.weight, self.bias), noisy, noise_out)
         return _NoisyProduct.apply(inputs, self.weight, self.bias, self.weight_sigma, self.bias_sigma, *noise)
 
+    def extra_repr(self) -> str:
+        """As that of ``nn.Linear``."""
+        return "in_features={1}, out_features={0}".format(*self.weight.shape)
+
 
 class _NoisyProduct(th.autograd.Function):
     """
