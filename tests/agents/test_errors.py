@@ -406,4 +406,4 @@ def test_arguments_of_the_policy_are_sent_there():
 
 def test_an_argument_without_effect_warns():
     with pytest.warns(UserWarning, match="optimize_memory_usage=True has no effect"):
-        EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, optimize_memory_usage=True, policy_kwargs=SMALL)
+        EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, optimize_memory_usage=True)
