@@ -6,7 +6,7 @@ The last rows of the EqR paper's tables, computed from the scores that the packa
 
 import pandas as pd
 
-from sb3_eqr.benchmark.reference import human_normalized, load_reference
+from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 
 # mean, median, games above human, as printed under Tables 2, 3 and 4 of the EqR paper
 PRINTED = {
@@ -26,6 +26,23 @@ PRINTED = {
     "EqR, L_{GET} [EqR Tab4]": (0.749, 0.377, 6),
     "EqR, $L_R + L_{GET}$ [EqR Tab4]": (0.886, 0.398, 7),
 }
+
+
+def human_normalized(scores: pd.DataFrame) -> pd.DataFrame:
+    """
+    (score - random) / (human - random), with the random and human scores of the paper's Table 2.
+
+    :param scores: columns method, game, mean
+    :return: rows games, columns methods
+    :raises ValueError: for a game that has no human score, with the names of those that have one
+    """
+    reference = load_reference().pivot(index="game", columns="method", values="mean")
+    unknown = set(scores["game"]) - set(reference.index)
+    if unknown:
+        raise ValueError(f"games: expected some of {', '.join(reference.index)}, found {', '.join(sorted(unknown))}")
+    table = scores.pivot(index="game", columns="method", values="mean")
+    low, high = reference.loc[table.index, RANDOM], reference.loc[table.index, HUMAN]
+    return table.sub(low, axis=0).div(high - low, axis=0)
 
 
 def last_rows() -> pd.DataFrame:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game, read_runs
-from sb3_eqr.benchmark.scores import load_results, score_table
+from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game
+from sb3_eqr.benchmark.scores import load_results, read_runs, score_table
 from sb3_eqr.benchmark.selection import choose_runs, never_learn, protocol_differences, settings_differences
 from sb3_eqr.benchmark.suites import Suite, nearest_name, read_suite
 
@@ -88,7 +88,7 @@ def compare(
 ) -> Comparison:
     """
     :param folders: of benchmarks
-    :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.reference.read_runs`
+    :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.scores.read_runs`
     :param force: compare agents with different protocols or games, too
     :param agents: those to compare; none: all
     :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first

@@ -18,7 +18,7 @@ from stable_baselines3.common.env_util import is_wrapped, make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
-from sb3_eqr.common.random_state import get_rng_state, set_rng_state
+from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.envs.atari_batch import AtariBatch, has_atari_batch
 
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation plays other games than training, and than that of another seed
@@ -175,15 +175,14 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     :param n_episodes: number of episodes
     :param seed: of the run
     """
-    before, n_threads = get_rng_state(model.action_space), th.get_num_threads()
-    play = play_environments
+    play, n_threads = play_environments, th.get_num_threads()
     if fits_atari_batch(protocol, model):
         play = play_atari
         th.set_num_threads(max(n_threads // 2, 1))  # the emulator has threads of its own
     try:
-        scores, lengths = play(model, protocol, n_episodes, FIRST_SEED + SEEDS * seed)
+        with preserved_rng_state(model.action_space):
+            scores, lengths = play(model, protocol, n_episodes, FIRST_SEED + SEEDS * seed)
     finally:
-        set_rng_state(before, model.action_space)
         th.set_num_threads(n_threads)
     return [float(score) for score in scores], [int(length) for length in lengths]
 

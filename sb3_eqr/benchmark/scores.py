@@ -1,14 +1,20 @@
-"""Scores as data: what the runs of a benchmark have written."""
+"""Scores as data: what the runs of a benchmark have written, and those of other methods' runs from a file."""
 
 import json
 import pathlib
-from typing import Any
+from collections.abc import Iterable
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from annotated_types import Len
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
+from sb3_eqr.benchmark.reference import match_games, plain_game
 from sb3_eqr.benchmark.runs import RESULT
 
+# game -> scores of runs
+RUNS = TypeAdapter(Annotated[dict[str, Annotated[list[FiniteFloat], Len(1)]], Len(1)], config={"strict": True})
 COLUMNS = ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
 
 
@@ -58,3 +64,47 @@ def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
             found[evaluation["step"]] = float(np.mean(evaluation["scores"]))
     steps = sorted(found)
     return np.array(steps), np.array([found[step] for step in steps])
+
+
+def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Iterable[str] = ()) -> pd.DataFrame:
+    """
+    Scores of another method's runs, in the form rliable publishes them: {"Alien": [812.0, 640.5, ...], ...}.
+
+    :param path: a JSON file: game -> raw scores, one per run
+    :param name: what to call the method
+    :param games: that are needed
+    :param others: further games that may be there and are left out
+    :return: columns agent, game, seed, score; as many runs on every game as the game with fewest has, the first ones; where
+        that leaves some out, ``attrs["note"]`` says so
+    :raises ValueError: for a file that is no JSON or has another form, and for missing and unknown games
+    """
+    games = list(games)
+    expected = f'reference {name}, {path}: expected {{"Game": [score, score, ...], ...}} with a raw score per run'
+    try:
+        content = RUNS.validate_json(pathlib.Path(path).read_bytes())
+    except OSError as error:
+        raise ValueError(f"{expected}, found no file to read: {error}") from error
+    except ValidationError as error:
+        mistake = error.errors()[0]
+        where = "".join(f"{place}: " for place in mistake["loc"])
+        raise ValueError(f"{expected}, found {where}{mistake['msg']}. Write its runs as lists of finite numbers.") from error
+    try:
+        matched = match_games(content, {plain_game(game): game for game in [*others, *games]}.values())
+    except ValueError as error:
+        raise ValueError(f"reference {name}, {path}: {error} Correct the name or take the game out.") from error
+    missing = [game for game in games if game not in matched.values()]
+    unused = [given for given, game in matched.items() if game not in games]
+    if missing:
+        raise ValueError(
+            f"reference {name}, {path}: expected scores for {', '.join(games)}, found none for {', '.join(missing)}"
+            f"{f' (not needed: {chr(44).join(unused)})' if unused else ''}. "
+            "Add them or report without this reference."
+        )
+    wanted = {game: content[given] for given, game in matched.items() if game in games}
+    runs = min(map(len, wanted.values()))
+    rows = [(name, game, seed, float(score)) for game in games for seed, score in enumerate(wanted[game][:runs])]
+    table = pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
+    if most := max(map(len, wanted.values())) - runs:
+        fewest = next(game for game, scores in wanted.items() if len(scores) == runs)
+        table.attrs["note"] = f"{name}: its first {runs} runs, as many as {fewest} has; other games have up to {most} more."
+    return table

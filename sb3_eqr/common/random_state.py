@@ -1,6 +1,8 @@
 """The state of all random generators that training draws from."""
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -27,3 +29,14 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
     if len(state["cuda"]) == th.cuda.device_count():
         th.cuda.set_rng_state_all(state["cuda"])
     action_space.np_random.bit_generator.state = state["action_space"]
+
+
+@contextmanager
+def preserved_rng_state(*action_spaces: spaces.Space) -> Iterator[None]:
+    """All generators have the same state after the ``with`` block as before it."""
+    states = [get_rng_state(space) for space in action_spaces]
+    try:
+        yield
+    finally:
+        for state, space in zip(states, action_spaces, strict=True):
+            set_rng_state(state, space)

@@ -4,7 +4,7 @@ import pathlib
 import random
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.groups import NoGroup
-from sb3_eqr.common.random_state import get_rng_state, set_rng_state
+from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.canvas import Line, Painter
@@ -87,7 +87,7 @@ def record(
     check_number("fps", fps, 1, 50)  # what a GIF can do
     if not formats or set(formats) - set(FORMATS):
         raise ValueError(f"formats: expected some of {list(FORMATS)}, found {formats!r}")
-    with _generators_kept(model):
+    with preserved_rng_state(model.action_space):
         film = shoot(model, env, n_steps, seed, deterministic)
     states = encode(model, film.observations)  # (T, D)
     ghosts = predictions(model, states, film.actions, film.starts, depth)
@@ -223,12 +223,3 @@ def _first_envs(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([obs[key][0] for obs in observations]) for key in observations[0]}
     return np.stack([obs[0] for obs in observations])
-
-
-@contextmanager
-def _generators_kept(model: EqRAlgorithm) -> Iterator[None]:
-    state = get_rng_state(model.action_space)
-    try:
-        yield
-    finally:
-        set_rng_state(state, model.action_space)

@@ -177,19 +177,14 @@ def _activity(model: EqRAlgorithm, observations: PyTorchObs) -> tuple[th.Tensor,
     trunk: Any = model.policy.online.features_extractor
     while isinstance(trunk, (GroupFeaturesExtractor, NormalizedExtractor)):
         trunk = trunk.trunk  # behind a layer norm, a unit that is always 0 is no constant
-    seen: list[tuple[th.Tensor, th.Tensor, th.Tensor, int]] = []
-
-    def note(_module: th.nn.Module, _inputs: tuple, output: th.Tensor) -> None:
-        h = output.flatten(1)
-        seen.append((h.amin(dim=0), h.amax(dim=0), h.abs().sum(dim=0), len(h)))
-
-    hook = trunk.register_forward_hook(note)
+    seen: list[th.Tensor] = []
+    hook = trunk.register_forward_hook(lambda _module, _inputs, output: seen.append(output.flatten(1)))
     try:
         encode(model, observations)
     finally:
         hook.remove()
-    low, high, total = (th.stack(rows) for rows in list(zip(*seen, strict=True))[:3])
-    return low.amin(dim=0), high.amax(dim=0), total.sum(dim=0) / sum(row[3] for row in seen)
+    outputs = th.cat(seen)  # (N, U)
+    return outputs.amin(dim=0), outputs.amax(dim=0), outputs.abs().mean(dim=0)
 
 
 def _block_norms(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:

@@ -14,8 +14,9 @@ from sb3_eqr.common.groups import SO, Group
 from sb3_eqr.plot_style import GREY, settings
 from sb3_eqr.visualize.latents import frame, split
 from sb3_eqr.visualize.measures import ROUNDING
-from sb3_eqr.visualize.style import MAX_PANELS, SIZE, panels
 
+SIZE = (6.0, 4.0)  # inches, of every picture
+MAX_PANELS = 12
 MAX_POINTS = 400
 MAX_ARROWS = 150
 ABOUT = "A point is a state: where a block moves the origin to, an arrow what it turns; or principal components."
@@ -59,6 +60,25 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
         figure.suptitle(f"Latent states{of_all}", fontsize=10)
         figure.text(0.46, 0.005, ABOUT, ha="center", fontsize=7, color=GREY)
         return figure
+
+
+def n_columns(count: int) -> int:
+    """
+    :param count: of panels
+    """
+    return 4 if count > 4 else min(count, 2)
+
+
+def panels(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
+    """
+    :return: so many axes, in rows of at most four
+    """
+    columns = n_columns(count)
+    rows = -(-count // columns)
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey).flatten().tolist()
+    for unused in axes[count:]:
+        unused.remove()
+    return axes[:count]
 
 
 def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap: str) -> PathCollection:

@@ -1,5 +1,7 @@
 """The latent states of an agent on windows of play: what every diagnostic, picture and animation looks at."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import prod
 from typing import Any, NamedTuple
 
@@ -13,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.latent_model import GroupLatentModel
-from sb3_eqr.common.random_state import get_rng_state, set_rng_state
+from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.validation import check_number
@@ -90,9 +92,7 @@ def play(
         n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
     )
     factors: list[np.ndarray | None] = []
-    spaces = (model.action_space, env.action_space)  # a random action is drawn from the first
-    states = [get_rng_state(space) for space in spaces]
-    try:
+    with preserved_rng_state(model.action_space, env.action_space):  # a random action is drawn from the first
         set_random_seed(seed)
         model.action_space.seed(seed)
         env.seed(seed)
@@ -107,9 +107,6 @@ def play(
                 env.unwrapped.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))
             ]
             obs = new_obs
-    finally:
-        for state, space in zip(states, spaces, strict=True):
-            set_rng_state(state, space)
     starts, envs = (grid.ravel() for grid in np.meshgrid(np.arange(buffer.n_starts), np.arange(env.num_envs), indexing="ij"))
     samples = buffer.windows(starts, envs)  # a VecNormalize has normalised them already
     known = all(found is not None for found in factors)
@@ -332,16 +329,13 @@ def _map(observations: PyTorchObs, function) -> Any:
     return function(observations)
 
 
-class eval_mode:
-    """The policy in eval mode while this lasts, then as it was."""
-
-    def __init__(self, model: EqRAlgorithm):
-        self._modules = [(module, module.training) for module in model.policy.modules()]
-
-    def __enter__(self) -> None:
-        for module, _ in self._modules:
-            module.training = False
-
-    def __exit__(self, *args: object) -> None:
-        for module, training in self._modules:
+@contextmanager
+def eval_mode(model: EqRAlgorithm) -> Iterator[None]:
+    """The policy in eval mode within the ``with`` block, then as it was."""
+    modes = [(module, module.training) for module in model.policy.modules()]
+    model.policy.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
             module.training = training

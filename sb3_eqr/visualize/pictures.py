@@ -16,9 +16,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, settings
 from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
-from sb3_eqr.visualize.latent_figure import latent_figure
+from sb3_eqr.visualize.latent_figure import MAX_PANELS, SIZE, latent_figure, n_columns, panels
 from sb3_eqr.visualize.measures import ROUNDING, Transition
-from sb3_eqr.visualize.style import MAX_PANELS, SIZE, n_columns, panels
 from sb3_eqr.visualize.tables import factor_names
 
 __all__ = ["all_pictures", "latent_figure", "write_pictures"]

@@ -5,7 +5,9 @@ import json
 import pytest
 
 from benchmarks.published_rows import disagreements, last_rows, published_table
-from sb3_eqr.benchmark.reference import human_normalized, load_reference, match_games, read_runs
+from benchmarks.published_rows import human_normalized
+from sb3_eqr.benchmark.reference import load_reference, match_games
+from sb3_eqr.benchmark.scores import read_runs
 from tests.tools.test_package import ROOT
 
 # mean, median, games above human, as printed under Tables 2, 3 and 4
@@ -103,12 +105,12 @@ def test_runs_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "reference X: expected a JSON file, found .*x.json"),
-        ("[1]", r"with a raw score per run, found \[1\]. Write one list per game"),
-        ('{"Pong": 3}', "found for Pong 3. Write its runs as a list of finite numbers"),
-        ('{"Pong": [1, NaN]}', "found for Pong"),
-        ('{"Pong": [true]}', "found for Pong"),
-        ('{"Pong": []}', "found for Pong"),
+        ("{", "reference X, .*x.json: expected .*, found Invalid JSON"),
+        ("[1]", "with a raw score per run, found Input should be an object. Write its runs as lists of finite numbers"),
+        ('{"Pong": 3}', "found Pong: Input should be a valid (list|array)"),
+        ('{"Pong": [1, NaN]}', "found Pong: 1: Input should be a finite number"),
+        ('{"Pong": [true]}', "found Pong: 0: Input should be a valid number"),
+        ('{"Pong": []}', "found Pong: List should have at least 1 item"),
         ('{"Pong": [1]}', "expected scores for Pong, BankHeist, found none for BankHeist. Add them"),
         ('{"Pong": [1], "BankHeis": [1]}', r"found 'BankHeis'. Did you mean 'BankHeist'\? Correct the name"),
     ],
@@ -118,5 +120,5 @@ def test_files_of_runs_that_are_wrong(tmp_path, content, message):
     file.write_text(content)
     with pytest.raises(ValueError, match=message):
         read_runs(file, "X", ["Pong", "BankHeist"])
-    with pytest.raises(ValueError, match=r"expected a JSON file, found .*nowhere"):
+    with pytest.raises(ValueError, match="expected .*, found no file to read: .*nowhere"):
         read_runs(tmp_path / "nowhere", "X", ["Pong"])
