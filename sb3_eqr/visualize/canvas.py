@@ -103,7 +103,10 @@ class Painter:
             self.canvas = FigureCanvasAgg(self.figure)
             self.game = self.figure.add_axes((0.01, 0.08, 0.37, 0.84))
             self.game.set_axis_off()
-            grid = self.figure.add_gridspec(rows, columns, left=0.4, right=0.99, bottom=0.1, top=0.92, wspace=0.1, hspace=0.1)
+            side = min(0.59 * WIDTH / columns, 0.82 * HEIGHT / rows)  # of a panel, in pixels
+            x, y = columns * side / WIDTH / 2, rows * side / HEIGHT / 2  # half of all panels, in parts of the frame
+            ends = {"left": 0.695 - x, "right": 0.695 + x, "bottom": 0.51 - y, "top": 0.51 + y}
+            grid = self.figure.add_gridspec(rows, columns, wspace=0.05, hspace=0.05, **ends)
             self.axes = [
                 self._panel(self.figure.add_subplot(grid[k // columns, k % columns]), p) for k, p in enumerate(panels)
             ]

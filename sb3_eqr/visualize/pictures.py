@@ -138,7 +138,7 @@ def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figur
         upright = max(map(len, labels)) * len(labels) * n_columns(len(axes)) > MAX_LETTERS
         ax.set_xlabel("action")
         ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=6)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn) if len(drawn) < 5 else 3)
     figure.supylabel("coordinate: radians, or latent units", fontsize=9)
     part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks: those it moves most)"
     figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
