@@ -55,8 +55,8 @@ class ReportFigure(NamedTuple):
 
     @staticmethod
     def width(png: bytes) -> int:
-        """In pixels of the page, of which the picture has two each."""
-        return int.from_bytes(png[16:20], "big") // 2
+        """In pixels of the page, a hundred an inch: letters as large as the text's notes."""
+        return 100 * int.from_bytes(png[16:20], "big") // DPI
 
 
 def to_png(shown: ReportFigure) -> bytes:
