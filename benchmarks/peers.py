@@ -1,7 +1,7 @@
 """
-The tests of SB3 and sb3-contrib, of the versions that are installed, with our agents in the places of theirs: EqRQRDQN in that
-of QRDQN, EqRRainbow in that of DQN. Their source archives are fetched from the package index. Exits with 1 if a test fails for
-which no reason stands here.
+The tests of the installed versions of SB3 and sb3-contrib, run with our agents in place of theirs: EqRQRDQN replaces QRDQN,
+EqRRainbow replaces DQN. The source archives are downloaded from the package index. Exits with 1 if a test fails and
+no reason for it is listed.
 
     python -m benchmarks.peers --out docs/results/peers.md
 """
@@ -19,24 +19,24 @@ SUITES = {"sb3-contrib": ("EqRQRDQN", "sb3_contrib.QRDQN"), "stable-baselines3":
 COPIED = (
     "it expects a target network that differs from the online one; the defaults copy it after every update, as the paper does"
 )
-BUFFER = "it looks at the arrays of SB3's own replay buffer; ours holds each frame once"
-COUNTER = "it fills all tensors with random numbers; those of batch norm in the latent networks count batches, as integers"
-TRUNK = "it looks for a layer of a custom features extractor, which sits at features_extractor.trunk"
-HER = "hindsight replay has a buffer of its own, without the sequences that the losses need"
+BUFFER = "it looks at the arrays of SB3's own replay buffer; ours stores each frame once"
+COUNTER = "it fills all tensors with random numbers, but batch norm's counters in the latent networks are integers"
+TRUNK = "it looks for a layer of a custom features extractor, which is at features_extractor.trunk here"
+HER = "hindsight replay uses its own buffer, without the sequences that the losses need"
 REASONS = {  # a module of tests, or a test without its parameters
     "test_her": HER,
     "test_n_step_replay": "it expects SB3's own buffer for n-step returns",
     "test_feature_extractor_target_net": COPIED,
     "test_features_extractor_target_net": COPIED,
     "test_image_like_input": "it expects an AssertionError for float images; ours is a ValueError that says what to pass",
-    "test_consistency": "MlpPolicy has a dense layer in front that MultiInputPolicy has not",
+    "test_consistency": "MlpPolicy starts with a dense layer that MultiInputPolicy does not have",
     "test_save_load_replay_buffer": BUFFER,
     "test_save_load": COUNTER,
     "test_save_load_policy": COUNTER,
     "test_offpolicy_collect_rollout_batch_norm": TRUNK,
     "test_predict_with_dropout_batch_norm": TRUNK,
-    "test_fps_logger": "it expects 100 steps a second, two updates a step included",
-    "test_offpolicy_multi_env": "it expects updates after 3 steps; a window of 10 steps is not complete by then",
+    "test_fps_logger": "it expects 100 steps per second, but each step includes two updates",
+    "test_offpolicy_multi_env": "it expects updates after 3 steps, before a window of 10 steps is complete",
     "test_warn_buffer": "it expects another warning about optimize_memory_usage, which has no effect here",
 }
 
@@ -72,9 +72,9 @@ def run(package: str, folder: pathlib.Path) -> dict[str, list[str]]:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=pathlib.Path, help="a Markdown page")
+    parser.add_argument("--out", type=pathlib.Path, help="the Markdown page to write")
     args = parser.parse_args()
-    lines = ["# The peers' own tests", "", " ".join(__doc__.split("\n\n")[0].split()), "", "```sh"]
+    lines = ["# The tests of SB3 and sb3-contrib", "", " ".join(__doc__.split("\n\n")[0].split()), "", "```sh"]
     lines += [
         "python -m benchmarks.peers --out docs/results/peers.md",
         "```",
@@ -89,7 +89,7 @@ def main() -> None:
         counts = " | ".join(str(len(found[outcome])) for outcome in ("passed", "skipped", "failed"))
         lines.append(f"| {package} {importlib.metadata.version(package)} | {agent} | {counts} |")
         failed += found["failed"]
-    lines += ["", "Those that fail, and why:", ""]
+    lines += ["", "The tests that fail, and why:", ""]
     unexplained = []
     for test in failed:
         module, _, name = test.partition(": ")

@@ -103,7 +103,7 @@ def published_table() -> str:
         f"| {row['table']} | {row['method']} | {row['mean']:.3f} | {row['median']:.3f} | {row['superhuman']} |"
         for row in rows.to_dict("records")
     ]
-    lines += ["", "All agree with what is printed, but for these:", "", *(f"- {text}" for text in disagreements(rows))]
+    lines += ["", "All agree with the paper except these:", "", *(f"- {text}" for text in disagreements(rows))]
     return "\n".join(lines)
 
 

@@ -72,7 +72,7 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(args.threads)
     register()
-    print("| agent | pictures | ms per step | ms per look | share of training |\n|---|---|---|---|---|")
+    print("| agent | pictures | ms per step | ms per call | share of training |\n|---|---|---|---|---|")
     for name, (make, before, timed) in AGENTS.items():
         for pictures in (True, False):
             step, look, share = measure(make, before, timed, pictures)

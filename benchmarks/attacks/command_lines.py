@@ -160,5 +160,5 @@ def wrong_command_lines(folder: pathlib.Path) -> Finding:
             wrong.append(f"{line}: {seconds:.0f} s: {last}")
         elif not last:
             wrong.append(f"{line}: no message")
-    must = "a message, no traceback, a status other than 0, none over 5 s"
-    return Finding(f"{count} wrong command lines", must, f"{count - len(wrong)} answered", not wrong, tuple(wrong))
+    must = "an error message, no traceback, a status other than 0, none over 5 s"
+    return Finding(f"{count} wrong command lines", must, f"{count - len(wrong)} rejected", not wrong, tuple(wrong))

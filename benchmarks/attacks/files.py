@@ -196,9 +196,9 @@ def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
             is_same = all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
             if not is_same or model.replay_buffer.size() != size:
                 wrong.append(f"{path.name}, {kind} at {place}: the agent has changed")
-    must = "every one refused, the model as before"
+    must = "every one rejected, the model unchanged"
     return Finding(
-        f"{count} damaged files of {len(loads)} kinds", must, f"{count - len(wrong)} refused", not wrong, tuple(wrong)
+        f"{count} damaged files of {len(loads)} kinds", must, f"{count - len(wrong)} rejected", not wrong, tuple(wrong)
     )
 
 
@@ -249,7 +249,7 @@ def shared_path(folder: pathlib.Path) -> Finding:
 def full_disk(folder: pathlib.Path) -> Finding:
     """A run whose checkpoints fill a small disk."""
     folder.mkdir(parents=True)
-    test, must = "a full disk (tmpfs of 2 MB)", "the last checkpoint is whole, the message says so"
+    test, must = "a full disk (tmpfs of 2 MB)", "the last checkpoint is intact, and the message says so"
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)], capture_output=True)
     if mounted.returncode != 0:
         return Finding(test, must, "cannot mount here", False)

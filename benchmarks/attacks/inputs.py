@@ -179,8 +179,8 @@ def wrong_arguments() -> Finding:
     """Every case of the tables and by hand."""
     cases = [*from_the_tables(), *by_hand()]
     wrong = [found for found in map(ask, cases) if found is not None]
-    must = "all answered by name, expected, got; none silent, none over 5 s"
-    return Finding(f"{len(cases)} wrong inputs", must, f"{len(cases) - len(wrong)} answered", not wrong, tuple(wrong))
+    must = "every error names the argument, what it must be and what it got; none silent, none over 5 s"
+    return Finding(f"{len(cases)} wrong inputs", must, f"{len(cases) - len(wrong)} rejected", not wrong, tuple(wrong))
 
 
 def without_asserts() -> Finding:
@@ -188,4 +188,4 @@ def without_asserts() -> Finding:
     call = "from benchmarks.attacks.inputs import wrong_arguments as f; x = f(); print(x.found, *x.details, sep='\\n')"
     done = subprocess.run([sys.executable, "-O", "-c", call], capture_output=True, text=True)
     found, *wrong = done.stdout.strip().splitlines() or [done.stderr[-200:]]
-    return Finding("the same with python -O", "all answered", found, done.returncode == 0 and not wrong, tuple(wrong))
+    return Finding("the same with python -O", "all rejected", found, done.returncode == 0 and not wrong, tuple(wrong))

@@ -92,5 +92,5 @@ def not_a_number(folder: pathlib.Path) -> Finding:
                 model.save(folder / "saved")
                 if not is_finite(folder / "saved.zip", kind):
                     wrong.append(f"{name}: NaN in the file")
-    must = "every one stopped and named, saved files finite"
+    must = "every one stopped with an error that names it, saved files finite"
     return Finding(f"NaN at {count} places", must, f"{count - len(wrong)} stopped", not wrong, tuple(wrong))
