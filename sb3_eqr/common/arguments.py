@@ -88,7 +88,7 @@ FREQUENCY = integer(1) | Rule(
 ALGORITHM: dict[str, Rule] = {
     "learning_rate": WEIGHT | FUNCTION,
     "buffer_size": integer(1),
-    "learning_starts": integer(0),
+    "learning_starts": integer(0) | NONE,
     "batch_size": integer(1),
     "tau": SHARE,
     "gamma": SHARE,

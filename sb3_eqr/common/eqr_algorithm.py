@@ -33,6 +33,7 @@ SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
 # Arguments of the replay buffer that are arguments of the algorithm, which moves them.
 SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
+MAX_LEARNING_STARTS = 2_000  # Table 5, of 100,000 steps
 
 
 class EqRAlgorithm(FiniteData, SafeFiles):
@@ -62,7 +63,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-4,
         buffer_size: int = 100_000,
-        learning_starts: int = 2_000,
+        learning_starts: int | None = None,
         batch_size: int = 32,
         tau: float = 1.0,
         gamma: float = 0.99,
@@ -104,7 +105,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
         :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
         :param buffer_size: size of the replay buffer, over all environments; per environment at least n + M + 1
-        :param learning_starts: how many steps of the model to collect transitions for before learning starts
+        :param learning_starts: how many steps of the model to collect transitions for before learning starts; ``None``: a
+            tenth of the first call of ``learn``, at most the paper's 2,000 (Table 5)
         :param batch_size: Minibatch size for each gradient update
         :param tau: how far the target moves at each target update, in [0, 1]; 1 copies the online networks
         :param gamma: the discount factor
@@ -162,7 +164,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             env,
             learning_rate=learning_rate,
             buffer_size=buffer_size,
-            learning_starts=learning_starts,
+            learning_starts=learning_starts,  # type: ignore[arg-type]
             batch_size=batch_size,
             tau=tau,
             gamma=gamma,
@@ -286,6 +288,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been set since
         result = super()._setup_learn(*args, **kwargs)
+        if self.learning_starts is None:
+            self.learning_starts = min(self._total_timesteps // 10, MAX_LEARNING_STARTS)
         validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)
         return result
 
@@ -386,6 +390,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
         self._log_last_round(check_model=True)
+        if log_interval is not None:  # SB3 logs when an episode ends: the updates since then are missing
+            self.dump_logs()
         return self
 
     def dump_logs(self) -> None:

@@ -5,8 +5,10 @@ import importlib
 import pathlib
 import runpy
 import sys
+import tempfile
 
 import gymnasium as gym
+import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import StoreDict, get_model_path
 
@@ -14,7 +16,7 @@ from sb3_eqr.common.checkpoints import read_manifest
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_algo, check_environment, check_machine, check_trained_agent, fail, nearest
-from sb3_eqr.zoo.entries import check_entry, read_entry
+from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 
 # The functions and modules of rl_zoo3 behind each command.
 FUNCTIONS = {
@@ -116,6 +118,12 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     entry = read_entry(path, args.env, args.hyperparams)
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
+    name = entry_name(read_file(path), args.env)
+    if name.startswith("default-"):  # RL Zoo would take "default"
+        file = pathlib.Path(tempfile.mkdtemp()) / f"{args.algo}.yml"
+        file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
+        print(f"Using the entry {name!r} of {path}")
+        return str(file)
     return path
 
 
@@ -211,6 +219,10 @@ def run(command: str, arguments: list[str]) -> None:
         fail(f"{command}: {error}.{advice}")
     except gym.error.DependencyNotInstalled as error:
         fail(str(error))
+    except NotImplementedError as error:
+        if "observation space is not supported" not in str(error):
+            raise
+        fail(f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these.")
     except AssertionError as error:
         if "as action spaces but" not in str(error):
             raise

@@ -6,9 +6,11 @@ import inspect
 import pathlib
 from typing import Any
 
+import gymnasium as gym
 import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_eqr.common.arguments import DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -37,6 +39,7 @@ def is_schedule(value: Any) -> bool:
         return False
 
 
+SMALLEST_IMAGE = 36  # pixels: what the convolutions of the "default-image" entries need
 # What it reads itself.
 RULES = {
     "n_timesteps": number(0, above=True),
@@ -72,6 +75,27 @@ def read_file(path: str) -> dict[str, Any]:
     return entries
 
 
+def entry_name(entries: dict[str, Any], env_id: str) -> str:
+    """
+    :param entries: of a file
+    :param env_id: the environment
+    :return: its own name, "atari", or that of a generic entry: "default", or "default-image" and "default-small-image" where
+        the file has them and the observations are images (RL Zoo knows "default" alone)
+    """
+    if env_id in entries:
+        return env_id
+    if exp_manager.ExperimentManager.is_atari(env_id):
+        return "atari"
+    if not any(name.startswith("default-") for name in entries):
+        return "default"
+    env = gym.make(env_id)
+    space = env.observation_space
+    env.close()
+    if not is_image_space(space):
+        return "default"
+    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_IMAGE else "default-image"
+
+
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
     """
     :param path: of the file
@@ -80,8 +104,7 @@ def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
     :return: the entry with the changes, as it is written; leaves with a message if there is none
     """
     entries = read_file(path)
-    is_atari = exp_manager.ExperimentManager.is_atari(env_id)
-    name = env_id if env_id in entries else "atari" if is_atari else "default"
+    name = entry_name(entries, env_id)
     if name not in entries:
         fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries) or 'none'}. Add one, or use another file.")
     if not isinstance(entries[name] or {}, dict):

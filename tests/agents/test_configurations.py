@@ -1,4 +1,4 @@
-"""Each named configuration is what the table in the docs says it is."""
+"""The named configurations match the tables in the docs."""
 
 import pathlib
 import re
@@ -42,14 +42,14 @@ EXPECTED = {
 
 
 def rows(text):
-    """Of a table of the docs: name -> arguments."""
+    """The rows of a table in the docs: name -> arguments."""
     found = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", text, re.M)
     return {name: eval(f"dict({arguments})") for name, arguments in found}
 
 
 def test_the_tables_and_the_files_agree():
     text = (ROOT / "docs" / "configurations.md").read_text().split("## Switches")[0]
-    of_paper, of_others = map(rows, text.split("The agents of others"))
+    of_paper, of_others = map(rows, text.split("Agents from other papers"))
     for name, arguments in of_paper.items():
         assert load_configuration("paper", **arguments) == load_configuration(name), name
     for name, arguments in of_others.items():
@@ -59,15 +59,15 @@ def test_the_tables_and_the_files_agree():
     assert load_configuration("se2+aet+r+get") == load_configuration("paper")
 
 
-def test_the_papers_agent_by_table_5():
-    """The figures of Table 5 and appendix B.4, one by one, on the agent as it is built."""
+def test_the_papers_agent_matches_table_5():
+    """The numbers of Table 5 and appendix B.4, checked one by one on the built agent."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
     model = EqRRainbow("CnnPolicy", env, **load_configuration("paper"), device="cpu")
     assert (model.batch_size, model.learning_starts, model.gamma, model.n_steps) == (32, 2_000, 0.99, 10)
     assert (model.train_freq.frequency, model.gradient_steps, model.max_grad_norm) == (1, 2, 10.0)
     assert (model.learning_rate, model.policy.optimizer.param_groups[0]["eps"]) == (1e-4, 1.5e-4)
     assert (model.shift_pixels, model.intensity_scale, model.prediction_depth) == (4, 0.05, 5)
-    assert (model.aet_coef / 5, model.symmetry_coef, model.reward_coef / 5) == (1, 1, 1)  # sums over five steps there
+    assert (model.aet_coef / 5, model.symmetry_coef, model.reward_coef / 5) == (1, 1, 1)  # the paper has sums over five steps
     assert (model.replay_buffer.alpha, model.replay_buffer.beta) == (0.5, 0.4)
     policy = model.policy
     assert (policy.sigma_init, policy.n_blocks, policy.online.head.n_atoms) == (0.5, 12, 51)
@@ -79,10 +79,11 @@ def test_the_papers_agent_by_table_5():
     ]
 
 
-def test_the_full_agent_is_the_default_one():
+def test_the_full_agent_is_the_default():
     """Every line of eqr_rainbow.yml repeats a default."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
     default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
+    default._setup_learn(100_000, None)  # learning_starts follows the length of the run
     for key, value in load_configuration("eqr_rainbow").items():
         if key not in ("policy_kwargs", "replay_buffer_kwargs", "train_freq"):
             assert getattr(default, key) == value, key
@@ -91,7 +92,7 @@ def test_the_full_agent_is_the_default_one():
     assert default.train_freq == named.train_freq
     for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
         found = getattr(default.policy, key)
-        assert (12 if found is None else found) == value  # n_blocks follows from the group
+        assert (12 if found is None else found) == value  # the default of n_blocks depends on the group
 
 
 def nonzero_gradients(module):
@@ -99,7 +100,7 @@ def nonzero_gradients(module):
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_each_is_trained_as_the_table_says(name):
+def test_each_configuration_trains_as_in_the_table(name):
     arguments = load_configuration(name)
     encoder_name, losses = EXPECTED[name]
     network = {"latent_hidden_dim": 16, **arguments.pop("policy_kwargs", {})}
@@ -129,12 +130,12 @@ def test_each_is_trained_as_the_table_says(name):
     assert noisy == (name not in ("drq", "eqr_bbf"))
     assert model.policy.latent_model.n_actions == 3
 
-    # losses: those of the table are logged and finite, and no others
+    # losses: exactly those of the table are logged, and they are finite
     logged = {key[len("train/") : -len("_loss")] for key in recorded if key.endswith("_loss")}
     assert logged == losses | {"td"}
     assert all(th.isfinite(th.tensor(value)) for key, value in recorded.items() if key.startswith("train/"))
 
-    # gradients: each part is trained by the losses that it serves
+    # gradients: each network is trained by its losses
     latent = model.policy.latent_model
     assert nonzero_gradients(encoder) and nonzero_gradients(model.policy.online.head)
     assert nonzero_gradients(latent.transition) == bool(losses)
@@ -146,8 +147,8 @@ def test_each_is_trained_as_the_table_says(name):
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-def test_eqr_bbf_is_the_recipe():
-    """The figures of the paper, one by one, on the agent as it is built at full width."""
+def test_eqr_bbf_follows_the_papers_recipe():
+    """The numbers of the paper, checked one by one on the agent at full width."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
     model = EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf"), device="cpu")
     trunk = model.policy.online.features_extractor
@@ -156,6 +157,7 @@ def test_eqr_bbf_is_the_recipe():
     assert head.value is not None and head.first[0].out_features == 2 * 2048 and head.n_atoms == 51
     assert (model.policy.v_min, model.policy.v_max) == (-10, 10)
     # 1 where the random steps end, 0 after 2,001 more
+    model._setup_learn(100_000, None)
     rates = [model.exploration_schedule(1 - step / 100_000) for step in (2_000, 3_000, 4_001, 50_000)]
     assert rates == pytest.approx([1, 1001 / 2001, 0, 0], abs=1e-4) and model.learning_starts == 2_000
     assert all(model.exploration_schedule(1 - step / 100_000) >= 1 for step in range(2_000))
@@ -175,7 +177,7 @@ def test_eqr_bbf_is_the_recipe():
 
 @pytest.mark.parametrize("path", configuration_files().values(), ids=lambda path: path.stem)
 def test_files_are_plain_ascii(path):
-    """RL Zoo opens them in the encoding of the machine."""
+    """RL Zoo opens them with the default encoding of the machine."""
     assert path.read_bytes().isascii()
 
 
@@ -189,12 +191,12 @@ def test_changes_are_merged():
 
 
 def test_rl_zoos_schedules_are_schedules():
-    """lin_1.5e-3 in the file: from there to 0."""
+    """lin_1.5e-3 in the file decreases from 1.5e-3 to 0."""
     learning_rate = load_configuration("stock/qrdqn", "LunarLander-v3")["learning_rate"]
     assert [learning_rate(remaining) for remaining in (1, 0.5, 0)] == pytest.approx([1.5e-3, 0.75e-3, 0])
 
 
-def test_unknown_names_are_told():
+def test_unknown_names_raise():
     with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
         load_configuration("bbf")
     with pytest.raises(ValueError, match=r"expected an entry of .*'atari'.*found 'CartPole-v1'"):

@@ -5,6 +5,7 @@ from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -130,7 +131,7 @@ def test_defaults_are_those_of_table_5(make):
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
     model = make.algorithm("CnnPolicy", env, device="cpu")
     assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
-    assert (model.learning_starts, model.gradient_steps, model.n_steps, model.prediction_depth) == (2000, 2, 10, 5)
+    assert (model.learning_starts, model.gradient_steps, model.n_steps, model.prediction_depth) == (None, 2, 10, 5)
     assert (model.train_freq.frequency, model.train_freq.unit.value, model.tau) == (1, "step", 1.0)
     buffer = model.replay_buffer
     assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.4, 1.0)
@@ -158,6 +159,24 @@ def test_defaults_are_those_of_table_5(make):
         assert policy.latent_model.transition[0].out_features == 256
     vectors = make.algorithm("MlpPolicy", ChainEnv(), device="cpu").policy.online.features_extractor
     assert isinstance(vectors.trunk, MlpExtractor) and vectors.features_dim == 256
+
+
+@pytest.mark.parametrize(("total_timesteps", "expected"), [(300, 30), (19_990, 1_999), (20_000, 2_000), (100_000, 2_000)])
+def test_learning_starts_after_a_tenth_of_the_first_run_and_at_most_2000_steps(make, total_timesteps, expected):
+    model = make.algorithm("MlpPolicy", ChainEnv(), device="cpu")
+    model._setup_learn(total_timesteps, None)
+    assert model.learning_starts == expected
+    model._setup_learn(50, None)
+    assert model.learning_starts == expected
+
+
+def test_the_last_table_has_the_updates_after_the_last_episode(make, tmp_path):
+    model = make(ChainEnv(), "MlpPolicy", learning_starts=20)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(63)
+    last = pd.read_csv(tmp_path / "progress.csv").iloc[-1]
+    assert last["time/total_timesteps"] == 63 and last["train/n_updates"] == model._n_updates
+    assert np.isfinite(last["train/td_loss"])
 
 
 # ---------------------------------------------------------------------------------------------- observations

@@ -65,7 +65,7 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     assert code == 0 and "qrdqn:fast, CartPole, seed 0: finished" in out.out
     before = {path: path.stat().st_mtime for path in files.glob("b/runs/*/*/*/result.json")}
     code, out = sb3_eqr(f"{line} --seeds 2 --address {cluster}")  # more seeds, and the other game
-    assert code == 0 and "2 of 8 runs are finished already." in out.out and "CartPole, seed 0: finished" not in out.out
+    assert code == 0 and "2 of 8 runs are already finished." in out.out and "CartPole, seed 0: finished" not in out.out
     results = {path: json.loads(path.read_text()) for path in files.glob("b/runs/*/*/*/result.json")}
     assert len(results) == 8 and all(path.stat().st_mtime == time for path, time in before.items())
     assert results[files / "b/runs/dqn-fast/Acrobot/1/result.json"]["command"].startswith(f"sb3-eqr benchmark {line}")
@@ -79,7 +79,7 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     assert counts.droplevel("kind").to_dict() == {(*run, step): n for run, row in expected.items() for step, n in row.items()}
     assert read_suite(files / "b" / "suite.yml").games == ["CartPole", "Acrobot"]
     code, out = sb3_eqr("run b")  # nothing is left
-    assert code == 0 and "8 of 8 runs are finished already." in out.out
+    assert code == 0 and "8 of 8 runs are already finished." in out.out
 
 
 BROKEN = f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 4, max_grad_norm: wrong')}\n"
@@ -91,7 +91,7 @@ def test_ray_tries_a_run_that_crashes_twice_while_the_others_go_on(files, sb3_eq
     line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
     line += f" --address {cluster}"
     code, out = sb3_eqr(line)
-    assert "Note: dqn:broken learns" not in out.out
+    assert "Note: dqn:broken makes" not in out.out
     assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
     assert "failed: dqn:broken, CartPole, seed 0:" in out.out
     assert json.loads(pathlib.Path("b/runs/dqn-fast/CartPole/0/result.json").read_text())["attempts"] == 1
@@ -157,28 +157,31 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
     [
         (
             "run b --suite atari10k --agents dqn",
-            "there is no suite 'atari10k'. Did you mean 'atari100k'? There are atari100k, atari",
+            "there is no suite 'atari10k'. Did you mean 'atari100k'? Choose from atari100k, atari",
         ),
         ("run b --suite atari100k --games Pnog --agents dqn", "suite 'atari100k' has no game 'Pnog'. Did you mean 'Pong'?"),
-        ("run b --suite smoke --agents dnq", "'dnq' is no algorithm. Did you mean 'dqn'?"),
-        ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no such hyperparameters. There are"),
-        ("run b --suite smoke --agents sac", "expected a game that sac can play, found discrete actions"),
-        ("run b --suite smoke --agents ppo --steps 2001", "in whole rounds of its 8 environments, found 2001 steps"),
-        ("run b --suite smoke --agents eqr_rainbow:se2+ate", "there are no such hyperparameters. Did you mean 'se2+aet'?"),
+        ("run b --suite smoke --agents dnq", "there is no algorithm 'dnq'. Did you mean 'dqn'?"),
+        ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no hyperparameters 'stock'. Choose from"),
+        ("run b --suite smoke --agents sac", "sac does not support discrete actions"),
+        ("run b --suite smoke --agents ppo --steps 2001", "steps must be a multiple of n_envs = 8, got 2001"),
+        (
+            "run b --suite smoke --agents eqr_rainbow:se2+ate",
+            "there are no hyperparameters 'se2+ate'. Did you mean 'se2+aet'?",
+        ),
         ("run b --suite minatar --agents eqr_rainbow:der", "no entry for 'MinAtar/Asterix-v1'"),
-        ("run b --suite smoke --agents dqn dqn", "expected different agents, found dqn more than once"),
-        ("run b --suite smoke", "expected both --suite and --agents, or neither"),
-        ("run b", "found no runs in it"),
-        ("run b --steps 30", "--steps: expected --suite and --agents with it"),
-        ("run b --suite smoke --agents eqr_rainbow:se2+aet+", "found se2+aet+get, se2+aet+r, se2+aet+r+get. Write one"),
+        ("run b --suite smoke --agents dqn dqn", "--agents must be different agents, got dqn more than once"),
+        ("run b --suite smoke", "--suite and --agents must be given together"),
+        ("run b", "got one without runs"),
+        ("run b --steps 30", "--steps needs --suite and --agents"),
+        ("run b --suite smoke --agents eqr_rainbow:se2+aet+", "got one of se2+aet+get, se2+aet+r, se2+aet+r+get. Choose one"),
         ("run b --suite smoke --agents dqn:other.yml", "'dqn:other.yml': there is no file other.yml"),
-        ("status b", "found no runs in it"),
-        (f"{RUN} --seeds 0", "--seeds: expected at least 1, found 0"),
-        (f"{RUN} --steps 0", "--steps: expected at least 1, found 0"),
+        ("status b", "got one without runs"),
+        (f"{RUN} --seeds 0", "--seeds must be >= 1, got 0"),
+        (f"{RUN} --steps 0", "--steps must be >= 1, got 0"),
         (f"{RUN} --cpus-per-run 0", "--cpus-per-run"),
         (f"{RUN} --device cuda:7", "PyTorch finds no GPU"),
         (f"{RUN} --suite-file other.yml", "there is no file other.yml"),
-        ("report b --reference x", "--reference: expected NAME=FILE, found 'x'"),
+        ("report b --reference x", "--reference must be NAME=FILE, got 'x'"),
     ],
 )
 def test_wrong_use_is_told(files, sb3_eqr, line, message):
@@ -189,7 +192,7 @@ def test_wrong_use_is_told(files, sb3_eqr, line, message):
 @pytest.mark.slow
 def test_runs_that_no_machine_can_hold_are_told(files, sb3_eqr, cluster):
     code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --address {cluster}")
-    assert code == 2 and "--cpus-per-run: expected at most the 1 CPUs of the largest machine, found 2" in out.err
+    assert code == 2 and "--cpus-per-run must be <= 1, the CPUs of the largest machine, got 2" in out.err
 
 
 def test_a_cluster_that_does_not_answer_is_told(files, sb3_eqr):
@@ -203,12 +206,12 @@ def test_other_settings_do_not_go_into_the_same_folder(files):
     write_plan(files / "b", suite, benchmark_plan)
     plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)  # nothing has begun yet
     (benchmark_plan[0].folder / "result.json").write_text("{}")
-    with pytest.raises(ValueError, match="expected steps 70, found a run with 60"):
+    with pytest.raises(ValueError, match="steps must be 60, as when the run was started, got 70"):
         plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)
     (files / "fast.yml").write_text(f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 8')}")
-    with pytest.raises(ValueError, match=r"expected hyperparameters.batch_size 8, found a run with 4"):
+    with pytest.raises(ValueError, match=r"hyperparameters.batch_size must be 4, as when the run was started, got 8"):
         plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
-    with pytest.raises(ValueError, match="expected a benchmark of suite 'smoke', found one of 'tiny'"):
+    with pytest.raises(ValueError, match="must hold a benchmark of suite 'smoke', got 'tiny'"):
         write_plan(files / "b", load_suite("smoke"), [])
 
 
@@ -220,32 +223,36 @@ def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
 
 def test_the_script_without_its_extra(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", "status", "b"])
-    monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.__main__", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.commands", raising=False)
     monkeypatch.setitem(sys.modules, "rich.console", None)
     with pytest.raises(
-        SystemExit, match=r'sb3-eqr: .*rich.*pip install "\.\[benchmark\]" in a clone of the repository brings it'
+        SystemExit, match=r'sb3-eqr benchmark: .*rich.*pip install "\.\[benchmark\]" in a clone of the repository'
     ):
         cli.main()
+    monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", "run", "--help"])
+    with pytest.raises(SystemExit) as exit:
+        cli.main()
+    assert exit.value.code == 0
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         ({"step": 1}, "unknown key 'step'. Did you mean 'steps'"),
-        ({"steps": {"CartPole": 10}}, "steps: expected them for every game, found none for Acrobot"),
-        ({"steps": 0}, "steps: CartPole: input should be greater than 0, found 0"),
-        ({"evaluation": {"episodes": 1, "n_envs": 1}}, "expected the key 'evaluation: curve', found none"),
+        ({"steps": {"CartPole": 10}}, "steps must have every game, got none for Acrobot"),
+        ({"steps": 0}, "steps: CartPole: input should be greater than 0, got 0"),
+        ({"evaluation": {"episodes": 1, "n_envs": 1}}, "evaluation: curve must be set, got nothing"),
         ({"evaluation": {**SUITE["evaluation"], "epsilom": 0}}, "unknown key 'evaluation: epsilom'. Did you mean 'epsilon'"),
-        ({"normalisation": {"unit": "x"}}, "expected the key 'normalisation: source', found none"),
-        ({"games": "CartPole"}, "games: input should be a valid list, found 'CartPole'"),
-        ({"env_id": "CartPole-v1"}, "expected {game} in it, found 'CartPole-v1'"),
-        ({"evaluation": None}, "evaluation: input should be a valid dictionary or i.*, found None"),
-        ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "evaluation: n_envs: input should be greater than 0, found 0"),
+        ({"normalisation": {"unit": "x"}}, "normalisation: source must be set, got nothing"),
+        ({"games": "CartPole"}, "games: input should be a valid list, got 'CartPole'"),
+        ({"env_id": "CartPole-v1"}, "env_id must contain {game}, got 'CartPole-v1'"),
+        ({"evaluation": None}, "evaluation: input should be a valid dictionary or i.*, got None"),
+        ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "evaluation: n_envs: input should be greater than 0, got 0"),
         (
             {"evaluation": {**SUITE["evaluation"], "epsilon": 7}},
-            "evaluation: epsilon: input should be less than or equal to 1, found 7",
+            "evaluation: epsilon: input should be less than or equal to 1, got 7",
         ),
-        ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "found none for CartPole, Acrobot"),
+        ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "got none for CartPole, Acrobot"),
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
 )
@@ -258,11 +265,11 @@ def test_suites_with_mistakes_are_told(files, change, message):
 @pytest.mark.parametrize(
     "preprocessing, message",
     [
-        ({}, "expected evaluation on whole games with raw scores, found no preprocessing"),
-        ({"env_wrapper": "sb3_eqr.envs.atari.Atari100kWrapper"}, "raw scores, found ClipRewardEnv, EpisodicLifeEnv"),
+        ({}, "evaluation must be on full episodes with raw scores, got no preprocessing"),
+        ({"env_wrapper": "sb3_eqr.envs.atari.Atari100kWrapper"}, "raw scores, got ClipRewardEnv, EpisodicLifeEnv"),
         (
             {"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}]},
-            "found an entry with its own frame_stack",
+            "got its own frame_stack",
         ),
     ],
 )
@@ -332,5 +339,5 @@ def test_agents_and_their_files():
 
 
 def test_scores_without_runs(tmp_path):
-    with pytest.raises(ValueError, match="found no finished run in it"):
+    with pytest.raises(ValueError, match="got one without finished runs"):
         benchmark.load_scores(tmp_path)

@@ -21,6 +21,7 @@ from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
+from tests.toys import ImageEnv
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_ranbow", "Did you mean 'eqr_rainbow'?"),
         ("enjoy --algo eqr_qrdnq", "Did you mean 'eqr_qrdqn'?"),
         ("train --algo eqr_qrdqn --env CartPol-v1", "Did you mean 'CartPole-v1'?"),
-        ("train --algo eqr_qrdqn --env Blackjack-v1", "no entry for 'Blackjack-v1'; it has atari, CartPole-v1"),
+        ("train --algo eqr_qrdqn --env Blackjack-v1", r"Tuple\(.* observation space is not supported. Wrap the environment"),
         ("train --algo eqr_qrdqn --gym-packages nopackage", "'nopackage' cannot be imported"),
         ("train --algo eqr_qrdqn --conf-file nofile", "none of .*eqr_bbf"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
@@ -153,6 +154,28 @@ def test_abbreviations_mean_what_they_mean_in_rl_zoo(sb3_eqr, capfd, tmp_path):
     with pytest.raises(SystemExit):
         sb3_eqr("train --alg eqr_qrdqn --hyperp n_stepz:3")
     assert "'n_stepz' is no argument" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("algo", ["eqr_qrdqn", "eqr_rainbow"])
+@pytest.mark.parametrize(
+    ("env_id", "name", "policy"),
+    [
+        ("FrozenLake-v1", "default", "MlpPolicy"),
+        ("SlidingBall-v0", "default-image", "CnnPolicy"),
+        ("SmallImages-v0", "default-small-image", "CnnPolicy"),
+    ],
+)
+def test_an_environment_without_an_entry_trains_by_the_one_for_its_observations(
+    sb3_eqr, tmp_path, monkeypatch, algo, env_id, name, policy
+):
+    monkeypatch.setitem(gym.registry, "SmallImages-v0", gym.spec("CartPole-v1"))  # taken out again at the end
+    gym.registry.pop("SmallImages-v0")
+    gym.register("SmallImages-v0", lambda: ImageEnv((10, 10, 3)))
+    out = sb3_eqr(f"train --algo {algo} --env {env_id} -n 90 -params learning_starts:40 --eval-freq -1 -f {tmp_path}")
+    assert (f"Using the entry {name!r}" in out) == (name != "default")
+    folder = tmp_path / algo / f"{env_id}_1"
+    model = zoo.AGENTS[algo].load(folder / f"{env_id}.zip")
+    assert model._n_updates > 0 and policy in (folder / env_id / "config.yml").read_text()
 
 
 def test_other_agents_pass(sb3_eqr, tmp_path):
