@@ -9,11 +9,11 @@ th.set_num_threads(1)  # small networks are slower on two threads, and xdist run
 
 @pytest.fixture(params=MAKERS, ids=lambda maker: maker.algorithm.__name__)
 def make(request):
-    """What makes small agents, of each algorithm in turn."""
+    """A maker of small agents, of each algorithm in turn."""
     return request.param
 
 
 @pytest.fixture
 def backup_each_round(monkeypatch):
-    """The way back ends where a round began."""
+    """Back up at the start of every round, so that a model is restored to it."""
     monkeypatch.setattr(UpdateMonitor, "INTERVAL", 0)

@@ -1,4 +1,4 @@
-"""Small agents of both algorithms, for tests that ask the same of each."""
+"""Small agents of both algorithms, for tests that check both."""
 
 from dataclasses import dataclass
 
@@ -19,17 +19,17 @@ SMALL = {
 }
 N_ATOMS = 9
 
-# The paper's network, without what docs/gradients.md changes: policy_kwargs. FLAT: and without a trunk, for vectors.
+# policy_kwargs of the paper's network, without the changes of docs/gradients.md; PAPER_FLAT also has no trunk, for vectors.
 PAPER = {"layer_norm": False, "head_input": "state", "projection": "head", "latent_tau": None, "sigma_init": 0.5}
 PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
-# Parametrize a question that has an answer in both.
+# For tests that must pass with both networks.
 NETWORKS = {"default": {}, "paper": PAPER}
 BOTH = pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
 
 
 @dataclass(frozen=True)
 class Maker:
-    """Makes small agents of one algorithm; the names of what differs between the algorithms."""
+    """Makes small agents of one algorithm, and knows the names that differ between the algorithms."""
 
     algorithm: type[EqRAlgorithm]
     n_atoms_name: str
@@ -42,17 +42,17 @@ class Maker:
 
 MAKERS = [Maker(EqRQRDQN, "n_quantiles"), Maker(EqRRainbow, "n_atoms")]
 
-# For slow questions that have nothing to do with the head.
+# For slow tests that do not depend on the head.
 EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRainbow"])
 
 
 def loss_terms(model, samples):
-    """What an update on these samples minimises."""
+    """The loss terms of an update on these samples."""
     return model.objective(samples, LossCoefs(model.td_coef, model.aet_coef, model.symmetry_coef, model.reward_coef))
 
 
 def train_on(model, samples):
-    """One update on samples of one's own choice."""
+    """One update on the given samples."""
     model.replay_buffer.sample = lambda *args, **kwargs: samples
     try:
         model.train(1, len(samples.indices))

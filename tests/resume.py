@@ -1,5 +1,5 @@
 """
-One half of the resuming test, run as a program of its own: load what the other half saved, go on, save.
+The second half of the test of resuming, run in its own process: load what the first half saved, continue, save.
 
     python -m tests.resume ALGORITHM FOLDER STEPS
 """
@@ -18,7 +18,7 @@ from tests.toys import ChainEnv
 
 
 class Save(BaseCallback):
-    """Saves everything between two rounds of the training loop: after an update, before the next step."""
+    """Save everything between two rounds of the training loop, after an update and before the next step."""
 
     def __init__(self, folder: pathlib.Path, at: int):
         super().__init__()
@@ -32,7 +32,7 @@ class Save(BaseCallback):
             (self.folder / "env.pkl").write_bytes(pickle.dumps(env.env_method("get_state")))
             if isinstance(env, VecNormalize):
                 env.save(str(self.folder / "normalize.pkl"))
-                (self.folder / "returns.pkl").write_bytes(pickle.dumps(env.returns))  # SB3 leaves them out
+                (self.folder / "returns.pkl").write_bytes(pickle.dumps(env.returns))  # SB3 does not save them
 
     def _on_step(self) -> bool:
         return True
@@ -49,12 +49,12 @@ def main(algorithm: str, folder: pathlib.Path, steps: int) -> None:
     th.set_num_threads(1)
     normalize = folder / "normalize.pkl"
     env = make_env(normalize if normalize.exists() else False)
-    env.unwrapped.reset()  # Monitor wants it; the states are set below
+    env.unwrapped.reset()  # Monitor requires it; the states are set below
     if isinstance(env, VecNormalize):
         env.returns = pickle.loads((folder / "returns.pkl").read_bytes())
     model = getattr(sb3_eqr, algorithm).load(
         folder / "model", env=env, device="cpu", force_reset=False, trust=True
-    )  # a lambda
+    )  # the file has a pickled lambda
     model.load_replay_buffer(folder / "buffer")
     for index, state in enumerate(pickle.loads((folder / "env.pkl").read_bytes())):
         env.env_method("set_state", state, indices=index)

@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 
 class ChainEnv(gym.Env):
-    """A noisy walk whose whole state can be read and set. Ends at either side, or by a time-out."""
+    """A noisy walk whose complete state can be read and set. Episodes end at either side or with a time-out."""
 
     def __init__(self, length: int = 20):
         self.observation_space = spaces.Box(-1, 1, (3,), np.float32)
@@ -64,7 +64,7 @@ class ImageEnv(gym.Env):
 
 
 class PoisonEnv(ChainEnv):
-    """Turns bad at a chosen step: ``where`` is "obs", "reward", "terminal" or "reset"."""
+    """Returns a bad value at a chosen step: ``where`` is "obs", "reward", "terminal" or "reset"."""
 
     def __init__(self, where: str, value: float = np.nan, at: int = 50):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Every argument of every constructor refuses what it must not be, in words that name it."""
+"""Every argument of every constructor rejects invalid values with an error that names it."""
 
 import inspect
 from datetime import timedelta
@@ -15,15 +15,15 @@ from sb3_eqr.eqr_rainbow import EqRRainbowPolicy
 from tests.toys import ChainEnv
 
 NOT_IN_A_TABLE = {
-    # the algorithm: checked by SB3 or by sb3_eqr.common.validation, which know what they belong to
+    # the algorithm: checked by SB3 or by sb3_eqr.common.validation, which know the context
     *("self", "policy", "env", "replay_buffer_class", "resets", "device", "_init_setup_model"),
-    # the policy: given by the algorithm, or read by make_group
+    # the policy: set by the algorithm, or parsed by make_group
     *("observation_space", "action_space", "lr_schedule", "group", "kwargs", "stock_kwargs"),
-    # the buffer: given by the algorithm, or without effect
+    # the buffer: set by the algorithm, or without effect
     *("buffer_size", "optimize_memory_usage", "handle_timeout_termination"),
 }
 NAN = float("nan")
-# What no argument may be, by the kind of thing that it is; a rule is asked about each.
+# Values of many kinds; each is tested against every rule that rejects it.
 STRANGERS = [NAN, float("inf"), -float("inf"), -1, -0.5, 1e400, 0.5, 3.0, 7, "many", "", True, None, [], {}, (), object]
 STRANGERS += [
     b"1",
@@ -55,7 +55,7 @@ ARGUMENTS = [(place, name) for place, rules in PLACES.items() for name in rules]
 
 
 @pytest.mark.parametrize("place, name", ARGUMENTS)
-def test_what_it_must_not_be_is_refused_by_name(place, name):
+def test_invalid_values_raise_and_name_the_argument(place, name):
     rule = PLACES[place][name]
     wrong = [value for value in STRANGERS if not rule.holds(value)]
     assert len(wrong) > 10
@@ -65,7 +65,7 @@ def test_what_it_must_not_be_is_refused_by_name(place, name):
         assert rule.says in str(caught.value)
 
 
-def test_no_argument_is_without_a_rule():
+def test_every_argument_has_a_rule():
     signatures = {
         EqRRainbow: ALGORITHM,
         EqRPolicy: POLICY,
@@ -80,7 +80,7 @@ def test_no_argument_is_without_a_rule():
 
 
 @pytest.mark.parametrize("name", ["max_grad_norm", "gamma", "aet_coef", "batch_size"])
-def test_what_is_set_later_is_checked_when_learning_starts(name):
+def test_attributes_set_later_are_checked_when_learning_starts(name):
     model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=10)
     setattr(model, name, -1)
     with pytest.raises(ValueError, match=f"{name} must be .*, got -1"):

@@ -1,4 +1,4 @@
-"""What people do with any SB3 model: copy it, average its parameters, misspell its arguments, bring an extractor."""
+"""What users do with any SB3 model: copy it, average its parameters, misspell arguments, pass a custom extractor."""
 
 import inspect
 import pickle
@@ -16,7 +16,7 @@ from tests.toys import ChainEnv, ImageEnv
 
 
 def continued(model):
-    """The same model, wherever its environment and the random generators were: some more updates on what is stored."""
+    """Some more updates on the stored transitions, independent of the environment and of the random generators' state."""
     th.manual_seed(0)
     model.replay_buffer._tree.set(th.arange(40).numpy(), 1.0)
     model.set_random_seed(0)
@@ -43,7 +43,7 @@ def test_a_model_can_be_copied_while_it_trains(make, copied, tmp_path):
 
 @pytest.mark.parametrize("policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv)])
 def test_state_dicts_are_floats_and_counters(make, policy, env):
-    """As sb3-contrib's tests of random parameters and of averaging ask."""
+    """As required by sb3-contrib's tests that randomise and average parameters."""
     model, other = (make(env(), policy, policy_kwargs={"whiten": True}, seed=seed) for seed in (0, 1))
     state = model.policy.state_dict()
     counters = {name for name, value in state.items() if not value.is_floating_point()}
@@ -83,7 +83,7 @@ def test_misspelt_arguments(make, kwargs, message):
         make(ChainEnv(), **kwargs)
 
 
-def test_the_signature_is_that_of_the_constructor(make):
+def test_the_signature_shows_the_constructors_arguments(make):
     parameters = inspect.signature(make.algorithm).parameters
     assert len(parameters) <= 38 and list(parameters)[:3] == ["policy", "env", "learning_rate"]
     assert not any(p.kind is p.VAR_KEYWORD for p in parameters.values())
@@ -96,7 +96,7 @@ def trunk_of(model):
 
 @EITHER
 @pytest.mark.parametrize("name", ["nature", "impala"])
-def test_our_extractors_take_features_dim(make, name):
+def test_our_extractors_accept_features_dim(make, name):
     network = {"features_extractor_class": name, "features_extractor_kwargs": {"features_dim": 24}}
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(50)
     assert model.policy.group_layer.to_algebra.in_features == 24
@@ -107,7 +107,7 @@ def test_our_extractors_take_features_dim(make, name):
         make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_kwargs": {"features_dim": 0}})
 
 
-def test_the_group_encoder_hands_features_dim_to_its_trunk():
+def test_the_group_encoder_passes_features_dim_to_its_trunk():
     encoder = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, n_blocks=2, features_dim=24)
     assert encoder.group_layer.to_algebra.in_features == 24 and encoder.features_dim == 12
     nature = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, trunk_class=NatureCNN, features_dim=24)
@@ -123,7 +123,7 @@ class Own(BaseFeaturesExtractor):
         return self.layer(observations)
 
 
-def test_a_custom_extractor_takes_features_dim():
+def test_a_custom_extractor_gets_features_dim():
     network = {"features_extractor_class": Own, "features_extractor_kwargs": {"features_dim": 5}}
     model = MAKERS[0](ChainEnv(), policy_kwargs=network)
     assert isinstance(trunk_of(model), Own) and trunk_of(model).features_dim == 5

@@ -1,4 +1,4 @@
-"""The Atari-100K protocol, against ALE driven by hand."""
+"""The Atari-100K protocol, compared with ALE controlled directly."""
 
 import cv2
 import gymnasium as gym
@@ -32,7 +32,7 @@ def test_names_of_two_words_and_unknown_games():
     assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
     with pytest.raises(ValueError, match="did you mean Pong"):
         make_atari100k_env("Pnog")
-    for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # not this protocol
+    for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # a different protocol
         with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'Pong"):
             make_atari100k_env(other)
     with pytest.raises(ValueError, match="n_envs"):
@@ -41,7 +41,7 @@ def test_names_of_two_words_and_unknown_games():
         make_atari100k_env("CartPole-v1")
 
 
-def test_observations_and_rewards_against_the_emulator_by_hand():
+def test_observations_and_rewards_match_the_emulator():
     seed = 5
     env = make_atari100k_env("Breakout", seed=seed)
     raw = gym.make("ALE/Breakout-v5", frameskip=1, repeat_action_probability=0.0).unwrapped
@@ -71,7 +71,7 @@ def test_observations_and_rewards_against_the_emulator_by_hand():
         assert np.array_equal(obs[0], np.stack(stack, axis=-1))
         assert rewards[0] == np.sign(reward)
         if dones[0]:
-            return  # a life was lost: SB3's wrapper now steps once more
+            return  # a life was lost: SB3's wrapper now makes one more step
         assert not terminated
 
 
@@ -90,7 +90,7 @@ def test_no_fire_no_sticky_actions():
     quiet = obs.copy()
     for _ in range(5):
         obs, *_ = env.step(np.array([0]))
-    assert np.array_equal(obs, quiet)  # nothing moves until the agent itself presses FIRE
+    assert np.array_equal(obs, quiet)  # nothing moves until the agent presses FIRE
     for action in (1, 1, 0, 0, 0):
         obs, *_ = env.step(np.array([action]))
     assert not np.array_equal(obs, quiet)
@@ -113,7 +113,7 @@ def test_life_loss_ends_an_episode_in_training_only(training):
     assert scores[0]["l"] > 100 and scores[0]["r"] >= 0
 
 
-def test_games_are_cut_at_the_step_limit(monkeypatch):
+def test_games_are_truncated_at_the_step_limit(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 30)
     env = make_atari100k_env("Pong", seed=0)
     env.reset()
@@ -125,20 +125,20 @@ def test_games_are_cut_at_the_step_limit(monkeypatch):
     assert (atari.MAX_STEPS, atari.FRAME_SKIP) == (30, 4)
 
 
-def test_the_limit_is_that_of_the_paper():
+def test_the_step_limit_follows_the_paper():
     env = make_atari100k_env("Pong", n_envs=2, seed=0)
     assert atari.MAX_STEPS * atari.FRAME_SKIP == 108_000 and env.num_envs == 2
     layer = games(env)[0]
-    while not isinstance(layer, atari.TimeLimit):  # RL Zoo puts another class into gymnasium.wrappers
+    while not isinstance(layer, atari.TimeLimit):  # RL Zoo replaces the class in gymnasium.wrappers
         layer = layer.env
     assert layer._max_episode_steps == 27_000
     env.reset()
     first, second = (env.step(np.array([0, 0]))[0][i] for i in (0, 1))
-    assert not np.array_equal(first, second)  # other seeds, other no-ops
+    assert not np.array_equal(first, second)  # different seeds give different no-ops
 
 
-def test_replay_of_real_games_is_that_of_the_plain_buffer():
-    """Lives lost, terminal observations, wrap-around: every frame bit by bit."""
+def test_replay_of_real_games_equals_the_plain_buffer():
+    """Every frame is the same, bit for bit, across lost lives, terminal observations and wrap-around."""
     env = make_atari100k_env("Breakout", n_envs=2, seed=0)
     obs = env.reset().transpose(0, 3, 1, 2)
     space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
@@ -167,7 +167,7 @@ def test_replay_of_real_games_is_that_of_the_plain_buffer():
     assert ours.nbytes / 300 < 8_500
 
 
-def test_the_main_job_in_small(tmp_path):
+def test_training_on_atari_saving_and_loading(tmp_path):
     env = make_atari100k_env("Pong", n_envs=1, seed=0)
     model = EqRQRDQN("CnnPolicy", env, seed=0, learning_starts=60, buffer_size=200, batch_size=8)
     model.learn(66)
@@ -183,8 +183,8 @@ def test_the_main_job_in_small(tmp_path):
     assert -21 <= mean <= 21
 
 
-def test_the_wrapper_for_rl_zoo_sees_what_training_sees():
-    """The same random actions: the same observations, clipped rewards and ends, whatever stands between the wrappers."""
+def test_the_wrapper_for_rl_zoo_gives_the_training_environment():
+    """The same random actions give the same observations, clipped rewards and ends, with other wrappers in between."""
     ours = make_atari100k_env("Breakout", seed=3)
     zoo = VecFrameStack(make_vec_env("BreakoutNoFrameskip-v4", seed=3, wrapper_class=Atari100kWrapper), 4)
     rng = np.random.default_rng(0)
@@ -198,7 +198,7 @@ def test_the_wrapper_for_rl_zoo_sees_what_training_sees():
     assert ends > 1
 
 
-def test_the_wrapper_refuses_what_is_another_protocol():
+def test_the_wrapper_rejects_a_different_protocol():
     with pytest.raises(ValueError, match=r"found .*'repeat_action_probability': 0.25.*NoFrameskip-v4 name"):
         make_vec_env("ALE/Pong-v5", wrapper_class=Atari100kWrapper)
     kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}
@@ -210,8 +210,8 @@ def test_the_wrapper_refuses_what_is_another_protocol():
 
 
 @pytest.mark.parametrize(("game", "max_steps", "n_steps"), [("Breakout", None, 330), ("Pong", 70, 75), ("AirRaid", 60, 65)])
-def test_games_in_a_batch_are_those_of_the_wrappers(monkeypatch, game, max_steps, n_steps):
-    """From the same no-ops by the same actions: every pixel, raw reward and end, over resets by ALE and by the limit."""
+def test_games_in_a_batch_equal_those_of_the_wrappers(monkeypatch, game, max_steps, n_steps):
+    """The same no-ops and actions give the same pixels, raw rewards and ends, across resets by ALE and by the step limit."""
     if max_steps is not None:
         monkeypatch.setattr(atari, "MAX_STEPS", max_steps)
     batch = AtariBatch(game, 2, seed=3)
@@ -241,7 +241,7 @@ def test_games_in_a_batch_are_those_of_the_wrappers(monkeypatch, game, max_steps
     assert n_ends >= 2 and total > 0
 
 
-def test_a_batch_begins_with_one_to_thirty_noops(monkeypatch):
+def test_a_batch_starts_with_one_to_thirty_noops(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 1)
     batch = AtariBatch("Pong", 4, seed=0)
     batch.reset()
@@ -250,12 +250,12 @@ def test_a_batch_begins_with_one_to_thirty_noops(monkeypatch):
         batch.send(np.zeros(4, dtype=int))
         assert batch.receive()[2].all()
         drawn += [*batch.n_noops]
-    # Of 84 draws from 1 ... 30: all legal, the ends reached to within 2, the mean within two standard errors.
+    # 84 draws from 1 ... 30: all in range, extremes within 2 of the ends, the mean within two standard errors.
     assert set(drawn) <= set(range(1, 31)) and min(drawn) <= 3 and max(drawn) >= 28
     assert np.mean(drawn) == pytest.approx(15.5, abs=1.9)
 
 
-def test_the_seed_of_a_batch_is_that_of_its_first_game():
+def test_the_seed_of_a_batch_is_the_seed_of_its_first_game():
     first, second, third = (AtariBatch("Pong", n, seed=seed) for n, seed in ((3, 5), (2, 6), (2, 5)))
     assert np.array_equal(first.reset()[1:], second.reset()) and np.array_equal(first.n_noops[1:], second.n_noops)
     third.reset()

@@ -1,4 +1,4 @@
-"""Checkpoints: a run that was stopped anywhere and resumed is the run that was not."""
+"""Checkpoints: an interrupted and resumed run equals an uninterrupted one."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ WORLDS["EqRRainbow"][2].pop("v")
 
 
 def resume(algorithm, folder):
-    """In another process: continue from the last checkpoint, save."""
+    """Run in another process: continue from the last checkpoint and save."""
     th.set_num_threads(1)
     env, *_ = WORLDS[algorithm]
     model = getattr(sb3_eqr, algorithm).resume(folder, env())
@@ -44,7 +44,7 @@ def resume(algorithm, folder):
 
 
 @pytest.mark.parametrize("algorithm", WORLDS)
-def test_resumed_in_a_new_process_to_the_last_bit(algorithm, tmp_path):
+def test_resuming_in_a_new_process_is_bit_identical(algorithm, tmp_path):
     kind = getattr(sb3_eqr, algorithm)
     env, policy, settings = WORLDS[algorithm]
     whole = kind(policy, env(), **{**SMALL, **settings}).learn(STEPS)
@@ -52,7 +52,7 @@ def test_resumed_in_a_new_process_to_the_last_bit(algorithm, tmp_path):
     stopped.learn(STEPS, ExactCheckpointCallback(30, tmp_path, keep=3))
     found = sorted(path.name for path in tmp_path.iterdir())
     assert len(found) == 3 and all(name.startswith("checkpoint-0000000001") for name in found[1:])
-    for later in found[1:]:  # as if it had been killed after the first of them
+    for later in found[1:]:  # as if the run had been killed after the first checkpoint
         for file in (tmp_path / later).iterdir():
             file.unlink()
         (tmp_path / later).rmdir()
@@ -75,7 +75,7 @@ def checkpoint(tmp_path):
 
 @pytest.mark.parametrize("name", ["model.zip", "replay_buffer.pkl", "environment.json", "manifest.json"])
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
-def test_a_changed_file_is_named_and_refused(checkpoint, name, damage):
+def test_a_damaged_checkpoint_raises(checkpoint, name, damage):
     path = checkpoint / name
     content = path.read_bytes()
     if damage == "gone":
@@ -89,8 +89,8 @@ def test_a_changed_file_is_named_and_refused(checkpoint, name, damage):
         EqRQRDQN.resume(checkpoint, ChainEnv())
 
 
-def test_the_last_complete_checkpoint_is_taken(checkpoint):
-    (checkpoint.parent / "checkpoint-000000000999").mkdir()  # of somebody else
+def test_the_last_complete_checkpoint_is_used(checkpoint):
+    (checkpoint.parent / "checkpoint-000000000999").mkdir()  # not a checkpoint
     assert EqRQRDQN.resume(checkpoint.parent, ChainEnv()).num_timesteps == int(checkpoint.name.partition("-")[2])
     with pytest.raises(ValueError, match="got nothing"):
         EqRQRDQN.resume(checkpoint.parent / "none", ChainEnv())
@@ -98,7 +98,7 @@ def test_the_last_complete_checkpoint_is_taken(checkpoint):
         EqRRainbow.resume(checkpoint, ChainEnv())
 
 
-def test_a_state_that_cannot_be_seen_is_warned_of(tmp_path):
+def test_an_environment_state_that_cannot_be_saved_warns(tmp_path):
     pytest.importorskip("Box2D")
     env = VecNormalize(make_vec_env("LunarLander-v3", 1))
     EqRQRDQN("MlpPolicy", env, **SMALL).learn(60, ExactCheckpointCallback(60, tmp_path))
@@ -116,7 +116,7 @@ def test_callback_arguments(wrong, tmp_path):
         ExactCheckpointCallback(**{"save_freq": 10, "save_path": tmp_path, **wrong})
 
 
-def test_runs_do_not_share_a_folder(checkpoint):
+def test_different_runs_cannot_share_a_folder(checkpoint):
     folder = checkpoint.parent
     before = sorted(folder.iterdir())
     for changes, why in (({"gamma": 0.5}, "gamma = 0.99 there, 0.5 here"), ({"seed": None}, r"seed = 3 there, None here")):
@@ -127,7 +127,7 @@ def test_runs_do_not_share_a_folder(checkpoint):
     EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(30, ExactCheckpointCallback(20, folder))  # the same run once more
 
 
-def test_a_run_without_a_seed_does_not_begin_again_in_its_folder(tmp_path):
+def test_a_run_without_a_seed_cannot_restart_in_its_folder(tmp_path):
     for is_first in (True, False):
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, "seed": None})
         if is_first:
@@ -137,7 +137,7 @@ def test_a_run_without_a_seed_does_not_begin_again_in_its_folder(tmp_path):
                 model.learn(60, ExactCheckpointCallback(20, tmp_path))
 
 
-def test_the_environment_must_be_built_alike(checkpoint):
+def test_the_environment_must_be_built_in_the_same_way(checkpoint):
     with pytest.raises(ValueError, match=r"must be a DummyVecEnv, got VecNormalize: .*VecNormalize included"):
         EqRQRDQN.resume(checkpoint, VecNormalize(make_vec_env(ChainEnv)))
     with pytest.raises(ValueError, match="env must be an environment, built as for the run"):

@@ -1,4 +1,4 @@
-"""The blind cliffwalk, and what prioritised replay is worth on it."""
+"""The blind cliffwalk, and the benefit of prioritised replay on it."""
 
 import sys
 
@@ -13,13 +13,13 @@ sys.path.insert(0, str(ROOT / "examples"))
 from blind_cliffwalk import make_model, updates_needed
 
 
-def test_the_environment_is_one():
+def test_the_environment_passes_the_checker():
     check_env(BlindCliffwalk(4), skip_render_check=True)
     with pytest.raises(ValueError, match="n_states must be an integer >= 1, got 0"):
         BlindCliffwalk(0)
 
 
-def test_rules():
+def test_transitions_and_rewards():
     env = BlindCliffwalk(3, seed=5)
     right = env.right_actions
     assert env.reset()[0] == 0
@@ -39,13 +39,13 @@ def test_rules():
 
 def test_the_replay_buffer_holds_every_sequence_once():
     buffer = make_model(5, seed=1, prioritized=True).replay_buffer
-    # 2^5 sequences; those that fail at step k are played as often as they have free actions after it: 2^(5 - k).
+    # 2^5 sequences; 2^(5 - k) of them fail at step k, because all later actions are free.
     assert buffer.full and buffer.size() == 2**6 - 2
     assert buffer.rewards.sum() == 1 and buffer.dones.sum() == 2**5
 
 
 @pytest.mark.slow
 def test_prioritised_replay_needs_fewer_updates():
-    """`python examples/blind_cliffwalk.py` does this with 10 seeds and longer walks: docs/results/cliffwalk.md."""
+    """`python examples/blind_cliffwalk.py` tests this with 10 seeds and longer walks: docs/results/cliffwalk.md."""
     uniform, prioritized = (np.median([updates_needed(6, seed, way) for seed in range(5)]) for way in (False, True))
     assert prioritized < 0.9 * uniform

@@ -1,4 +1,4 @@
-"""Captured updates. What a graph does is checked where there is a GPU; elsewhere, that nothing depends on one."""
+"""Captured updates. With a GPU, the tests check the graph; without one, that updates need no GPU."""
 
 import pickle
 
@@ -15,7 +15,7 @@ from tests.toys import ChainEnv, ImageEnv
 ENVS = {
     "MlpPolicy": lambda: make_vec_env(ChainEnv, 2),
     "CnnPolicy": lambda: VecFrameStack(make_vec_env(ImageEnv, 2), 4),
-    "MultiInputPolicy": lambda: np.random.seed(0) or SimpleMultiObsEnv(channel_last=True),  # draws its images when it is made
+    "MultiInputPolicy": lambda: np.random.seed(0) or SimpleMultiObsEnv(channel_last=True),  # its constructor draws the images
 }
 POLICIES = pytest.mark.parametrize("policy", ENVS)
 GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
@@ -40,8 +40,8 @@ def test_without_a_gpu_updates_are_eager_and_a_warning_says_why(make):
     "network", [{}, {"group": "GL(2)", "whiten": True, "aet_loss": "contrastive"}], ids=["default", "whitened"]
 )
 @POLICIES
-def test_an_objective_needs_no_number_from_the_device(make, policy, network):
-    """On the meta device there are no numbers: to ask for one, or to mix in a tensor of the CPU, is an error."""
+def test_the_objective_reads_no_number_from_the_device(make, policy, network):
+    """The meta device has no numbers: reading one, or mixing in a CPU tensor, is an error."""
     model = make(ENVS[policy](), policy, device="meta", policy_kwargs=network, learning_starts=1_000, prioritized_replay=False)
     model.replay_buffer.device = th.device("cpu")
     filler = make(ENVS[policy](), policy, learning_starts=1_000, prioritized_replay=False).learn(50)
@@ -69,7 +69,7 @@ def same_within(a, b, tolerance):
 
 @GPU
 @POLICIES
-def test_captured_is_eager_to_rounding(make, policy):
+def test_captured_updates_equal_eager_ones_to_rounding(make, policy):
     models = [make(ENVS[policy](), policy, device="cuda", cuda_graph=asked).learn(120) for asked in (False, True)]
     assert models[1]._captured.failure is None and models[1]._captured._graph is not None
     assert models[0]._n_updates == models[1]._n_updates >= 30
@@ -77,8 +77,8 @@ def test_captured_is_eager_to_rounding(make, policy):
 
 
 @GPU
-def test_what_a_graph_depends_on_is_captured_again(make):
-    """A weight that a callback moves, a part that is frozen, a reset: the captured run stays the eager one."""
+def test_changes_that_a_graph_depends_on_recapture_it(make):
+    """The captured run equals the eager one after a callback changes a weight, a network is frozen, or a reset."""
     models = []
     for asked in (False, True):
         model = make(ChainEnv(), device="cuda", cuda_graph=asked, resets={"interval": 40}, tau=0.9).learn(90)
@@ -91,7 +91,7 @@ def test_what_a_graph_depends_on_is_captured_again(make):
 
 
 @GPU
-def test_what_cannot_be_captured_runs_eagerly(make):
+def test_updates_that_cannot_be_captured_run_eagerly(make):
     """A matrix exponential reads a number back."""
     network = {"group": "SO(3)", "parameterization": "exp"}
     with pytest.warns(UserWarning, match="cuda_graph: updates run eagerly, because"):

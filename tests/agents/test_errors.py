@@ -1,4 +1,4 @@
-"""Wrong input is refused before the first step; what goes wrong later loses nothing."""
+"""Invalid input raises before the first step; errors during training do not damage the model."""
 
 import warnings
 
@@ -87,12 +87,12 @@ def test_arguments_out_of_range(make, kwargs, message):
         make(ChainEnv(), **kwargs)
 
 
-def test_a_buffer_is_counted_per_environment(make):
+def test_the_minimum_buffer_size_is_per_environment(make):
     with pytest.raises(ValueError, match="buffer_size=24"):
         make(make_vec_env(ChainEnv, 4), buffer_size=23)
 
 
-def test_a_frame_stack_that_is_not_one(make):
+def test_observations_that_are_not_a_frame_stack(make):
     with pytest.raises(ValueError, match="expected a divisor"):
         make(ImageEnv((3, 36, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 2})
     model = make(ImageEnv((4, 40, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 4})
@@ -112,14 +112,14 @@ def test_bad_values_from_the_environment(make, where, what, value, normalize):
         model.learn(100)
     assert model.replay_buffer.size() == 59 and model._n_updates > 0
     if normalize:
-        return  # a resumed VecNormalize has a test of its own
-    model.learn(5, reset_num_timesteps=False)  # resets the environment: no transition spans the gap
+        return  # resuming with VecNormalize has its own test
+    model.learn(5, reset_num_timesteps=False)  # resets the environment, so no transition crosses the error
     assert model.replay_buffer.timeouts[58].all() or model.replay_buffer.dones[58].all()
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
 @pytest.mark.parametrize("where", ["obs", "reward"])
-def test_a_refused_step_leaves_the_statistics_of_vec_normalize(make, where):
+def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, where):
     env = VecNormalize(DummyVecEnv([lambda: PoisonEnv(where, at=50)]))
     model = make(env)
     with pytest.raises(ValueError, match="step 50: expected finite"):
@@ -139,7 +139,7 @@ def test_observations_of_predict_must_be_finite(make, value):
         model.predict(np.array([0.0, value, 0.0], dtype=np.float32))
 
 
-def test_a_bad_first_observation_is_refused_before_the_first_step(make):
+def test_a_bad_first_observation_raises_before_the_first_step(make):
     model = make(PoisonEnv("reset"))
     with pytest.raises(ValueError, match="step 0: expected finite observations"):
         model.learn(10)
@@ -148,14 +148,14 @@ def test_a_bad_first_observation_is_refused_before_the_first_step(make):
 
 @pytest.mark.parametrize("trained", [0, 5])
 @pytest.mark.usefixtures("backup_each_round")
-def test_losses_that_are_not_finite_leave_the_last_good_model(make, trained, tmp_path):
-    """The first loss of a round tells on the round before: the model goes back to where that one began."""
+def test_losses_that_are_not_finite_restore_the_last_good_model(make, trained, tmp_path):
+    """The first loss of a round is computed after the previous round, so the model is restored to the start of that round."""
     model = make(ChainEnv()).learn(40 + trained)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
     slots, updates = len(model.policy.optimizer.state), model._n_updates
     model.learn(1, reset_num_timesteps=False)
     assert model._n_updates == updates + 2
-    model.replay_buffer.rewards[:] = 3e38  # finite, but neither its square nor its double
+    model.replay_buffer.rewards[:] = 3e38  # finite, but its square and its double are not
     model.train(gradient_steps=2, batch_size=8)
     assert not all(th.isfinite(p).all() for p in model.policy.parameters())
     message = f"update {updates + 3}: expected finite losses, found .*reward_loss = inf.* put back to update {updates} "
@@ -167,12 +167,12 @@ def test_losses_that_are_not_finite_leave_the_last_good_model(make, trained, tmp
     states = [value for state in model.policy.optimizer.state.values() for value in state.values()]
     assert all(th.isfinite(value).all() for value in states)
     assert list(tmp_path.iterdir()) == []
-    model.save(tmp_path / "model")  # what was kept can be saved
+    model.save(tmp_path / "model")  # the restored model can be saved
     assert make.algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
 
 
 @pytest.mark.usefixtures("backup_each_round")
-def test_the_very_first_update_may_be_the_bad_one(make):
+def test_the_first_update_may_be_bad(make):
     model = make(ChainEnv(), learning_starts=1000).learn(60)
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
     model.replay_buffer.rewards[:] = 1e38
@@ -190,8 +190,8 @@ def test_the_very_first_update_may_be_the_bad_one(make):
 @pytest.mark.parametrize("gradient_steps", [1, 2, 3])
 @pytest.mark.parametrize("good_rounds", [0, 1, 4])
 @pytest.mark.usefixtures("backup_each_round")
-def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, gradient_steps, good_rounds):
-    """The losses of an update do not show what its own step has done: the next round's do."""
+def test_an_explosion_in_the_last_step_of_a_round_restores_the_model(make, gradient_steps, good_rounds):
+    """The losses of an update do not show the effect of its own step; those of the next round do."""
     model = make(ChainEnv(), gradient_steps=gradient_steps, learning_starts=40)
     sizes = []
 
@@ -213,8 +213,8 @@ def test_parameters_blown_up_by_the_last_step_of_a_round_are_not_kept(make, grad
 
 
 @EITHER
-def test_the_very_last_update_is_looked_at_before_learn_returns(make, tmp_path):
-    """Its losses are finite; what its step has done shows in the parameters alone."""
+def test_the_last_update_is_checked_before_learn_returns(make, tmp_path):
+    """Its losses are finite, and only the parameters show the effect of its step."""
     model = make(ChainEnv(), learning_starts=40, gradient_steps=1)
 
     class Callback(BaseCallback):
@@ -241,12 +241,12 @@ def test_parameters_that_are_not_finite_are_never_saved(make, tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [-5, float("nan"), "many", None, True])
-def test_steps_that_cannot_be_made(make, wrong):
+def test_invalid_total_timesteps(make, wrong):
     with pytest.raises(ValueError, match="total_timesteps must be a finite number >= 0, got"):
         make(ChainEnv()).learn(wrong)
 
 
-def test_moving_n_beyond_the_buffer_is_refused(make):
+def test_setting_n_steps_beyond_the_buffer_raises(make):
     model = make(ChainEnv(), buffer_size=50).learn(60)
     model.n_steps = 60
     with pytest.raises(ValueError, match="n_steps \\+ prediction_depth \\+ 1 = 63"):
@@ -263,12 +263,12 @@ def test_vec_normalize_inside_a_wrapper_that_changes_observations(make, stacked)
     assert make(right, "CnnPolicy").learn(60)._n_updates > 0
 
 
-def test_greedy_exploration_is_warned_of(make):
+def test_greedy_exploration_warns(make):
     with pytest.warns(UserWarning, match="exploration_final_eps"):
         make(ChainEnv(), policy_kwargs={"noisy": False})
 
 
-def test_small_settings_are_what_these_tests_think():
+def test_the_small_settings_match_these_tests():
     assert SMALL["n_steps"] + SMALL["prediction_depth"] + 1 == 6
 
 
@@ -289,12 +289,12 @@ def test_numbers_of_atoms(algorithm, name):
     ],
     ids=str,
 )
-def test_supports_that_are_none(support, message):
+def test_invalid_supports(support, message):
     with pytest.raises(ValueError, match=message):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=support)
 
 
-def test_policy_kwargs_that_there_are_not(make):
+def test_unknown_policy_kwargs(make):
     other = "n_atoms" if make.n_atoms_name == "n_quantiles" else "n_quantiles"
     with pytest.raises(TypeError, match=f"policy_kwargs: EqR.*Policy got an unexpected argument {other!r}"):
         make(ChainEnv(), policy_kwargs={other: 5})
@@ -313,14 +313,14 @@ class ScriptedRewards(ChainEnv):
 @pytest.mark.parametrize(
     "rewards, step, value",
     [
-        ([0.5, -25.0, 0.0], 2, "-25"),  # one reward is enough
+        ([0.5, -25.0, 0.0], 2, "-25"),  # one reward suffices
         ([0.0] * 60 + [8.0, 8.0], 62, "15.92"),  # late in the episode, far from its start: 8 + 0.99 * 8
         ([1.0] * 11, 11, "10.47"),  # (1 - 0.99^11) / 0.01
-        ([9.0, 5.0, -4.0, -5.0], None, None),  # 13.95 on the way, but no state's return: 5.23, -3.81, -8.95, -5
+        ([9.0, 5.0, -4.0, -5.0], None, None),  # a sum of 13.95 on the way, but the states' returns are 5.23, -3.81, -8.95, -5
         ([1.0] * 10, None, None),  # 9.56
     ],
 )
-def test_returns_that_the_support_cannot_hold_are_warned_of_once(rewards, step, value):
+def test_returns_outside_the_support_warn_once(rewards, step, value):
     model = EqRRainbow("MlpPolicy", make_vec_env(lambda: ScriptedRewards(rewards)), learning_starts=1_000, device="cpu")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -332,7 +332,7 @@ def test_returns_that_the_support_cannot_hold_are_warned_of_once(rewards, step, 
         assert len(found) == 1 and f"step {step}: a discounted return of {value} was seen" in found[0]
 
 
-def test_a_support_that_holds_the_returns_is_not_warned_of():
+def test_returns_within_the_support_do_not_warn():
     kwargs = {"learning_starts": 100, "seed": 0}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -341,7 +341,7 @@ def test_a_support_that_holds_the_returns_is_not_warned_of():
         EqRRainbow("MlpPolicy", scaled, **kwargs).learn(200)
 
 
-def test_what_a_buffer_is_given_directly(make):
+def test_buffer_add_checks_its_arguments(make):
     buffer = make(ChainEnv()).replay_buffer
     obs, one, zero = np.zeros((1, *buffer.obs_shape)), np.ones(1), np.zeros(1)
     for action in (buffer.action_space.n, -1, np.nan):
@@ -349,7 +349,7 @@ def test_what_a_buffer_is_given_directly(make):
             buffer.add(obs, obs, np.array([action]), one, zero, [{}])
     with pytest.raises(ValueError, match="reward must be finite, got inf"):
         buffer.add(obs, obs, zero, one * np.inf, zero, [{}])
-    with pytest.raises(ValueError, match=r"next_obs must be finite, got 1e\+39"):  # float32 does not hold it
+    with pytest.raises(ValueError, match=r"next_obs must be finite, got 1e\+39"):  # not representable in float32
         buffer.add(obs, obs + 1e39, zero, one, zero, [{}])
     assert buffer.size() == 0
 
@@ -359,7 +359,7 @@ def test_a_call_of_learn_without_updates_warns(make):
         make(ChainEnv(), learning_starts=50).learn(50)
 
 
-def test_an_agent_without_what_it_was_trained_with_warns(make, tmp_path):
+def test_resuming_without_vec_normalize_or_replay_buffer_warns(make, tmp_path):
     model = make(VecNormalize(make_vec_env(ChainEnv)))
     model.learn(60)
     model.save(tmp_path / "model")
@@ -378,12 +378,12 @@ def test_devices(make):
             make(ChainEnv(), device="cuda:0")
 
 
-def test_every_wrong_argument_is_answered_by_name():
+def test_every_error_names_the_wrong_argument():
     found = wrong_arguments()
     assert found.holds, found.details
 
 
-def test_a_new_vec_normalize_is_warned_of(make, tmp_path):
+def test_resuming_with_a_new_vec_normalize_warns(make, tmp_path):
     model = make(VecNormalize(make_vec_env(ChainEnv)))
     model.learn(60)
     model.save(tmp_path / "model")
@@ -393,12 +393,12 @@ def test_a_new_vec_normalize_is_warned_of(make, tmp_path):
 
 
 @pytest.mark.parametrize("env", [ChainEnv, 3])
-def test_what_is_no_environment(make, env):
+def test_invalid_environments(make, env):
     with pytest.raises(ValueError, match=r"env must be an environment or a VecEnv, got .*make_vec_env"):
         make(env)
 
 
-def test_arguments_of_the_policy_are_sent_there():
+def test_arguments_of_the_policy_are_redirected_to_policy_kwargs():
     for kind, name in ((EqRRainbow, "v_min"), (EqRQRDQN, "n_quantiles"), (EqRRainbow, "layer_norm")):
         with pytest.raises(TypeError, match=rf"unexpected argument '{name}'. Pass policy_kwargs=dict\({name}=...\)"):
             kind("MlpPolicy", ChainEnv(), **{name: 1})

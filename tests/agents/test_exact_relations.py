@@ -1,4 +1,4 @@
-"""The relations of the design that hold to the last bit."""
+"""Relations between agents that hold bit for bit."""
 
 import pytest
 import torch as th
@@ -38,7 +38,7 @@ SHARED = {
     "seed": 3,
     "device": "cpu",
 }
-# The optimiser is the same to its kernel: Adam's three kernels round differently.
+# The optimiser has the same kernel, because Adam's three kernels round differently.
 NETWORK = {
     "n_quantiles": 20,
     "net_arch": [32],
@@ -58,7 +58,7 @@ def assert_same_networks(ours, theirs):
 
 
 @pytest.mark.parametrize("n_envs, n_steps, max_grad_norm, tau", [(1, 1, None, 1.0), (1, 3, 10.0, 1.0), (3, 5, 0.5, 0.3)])
-def test_with_every_switch_off_it_is_qrdqn(n_envs, n_steps, max_grad_norm, tau):
+def test_with_every_switch_off_it_equals_qrdqn(n_envs, n_steps, max_grad_norm, tau):
     extra = {"n_steps": n_steps, "max_grad_norm": max_grad_norm, "tau": tau}
     env = [make_vec_env(ChainEnv, n_envs) for _ in range(2)]
     theirs = QRDQN("MlpPolicy", env[0], policy_kwargs=dict(NETWORK), **{**SHARED, **extra}).learn(300)
@@ -68,7 +68,7 @@ def test_with_every_switch_off_it_is_qrdqn(n_envs, n_steps, max_grad_norm, tau):
 
 
 @pytest.mark.parametrize("extractor", [NatureCNN, ConvExtractor])
-def test_on_images_too(extractor):
+def test_with_every_switch_off_it_equals_qrdqn_on_images(extractor):
     shared = {**SHARED, "learning_starts": 40, "train_freq": 8, "gradient_steps": 1}
     trunk = {"features_extractor_class": extractor}
     theirs = QRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk}, **shared).learn(120)
@@ -78,7 +78,7 @@ def test_on_images_too(extractor):
 
 
 def test_the_group_encoder_is_a_plain_features_extractor():
-    """The same encoder in stock QRDQN and in ours."""
+    """The same encoder in stock QRDQN and in EqRQRDQN."""
     encoder = {"group": "SE(2)", "n_blocks": 3}
     theirs_kwargs = {**NETWORK, "features_extractor_class": GroupFeaturesExtractor, "features_extractor_kwargs": encoder}
     theirs = QRDQN("MlpPolicy", ChainEnv(), policy_kwargs=theirs_kwargs, **SHARED).learn(200)
@@ -88,8 +88,8 @@ def test_the_group_encoder_is_a_plain_features_extractor():
 
 
 @pytest.mark.parametrize("switched_off", ["aet_coef", "symmetry_coef", "reward_coef", "prediction_depth"])
-def test_each_switch_does_something(switched_off):
-    """The relation above says nothing if the switches are not wired."""
+def test_each_switch_has_an_effect(switched_off):
+    """The relation above would prove nothing if the switches had no effect."""
     settings = {**SHARED, "n_steps": 3, "prediction_depth": 2, "target_update_interval": None}
     full = EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(70)
     less = EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, switched_off: 0}).learn(70)
@@ -101,7 +101,7 @@ def same_state(a, b):
     return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
 
 
-def test_same_seed_twice_other_seed_once():
+def test_same_seed_same_run_and_different_seed_different_run():
     settings = {**SHARED, "n_steps": 3, "target_update_interval": None}
     a, b, c = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, "seed": s}).learn(80) for s in (1, 1, 2))
     assert same_state(a, b)
@@ -110,7 +110,7 @@ def test_same_seed_twice_other_seed_once():
 
 @BOTH
 def test_sharing_the_target_pass_changes_no_number(network, monkeypatch):
-    """Where the target is a copy of the online networks, one pass serves both: a shortcut, not another algorithm."""
+    """If the target is a copy of the online networks, one pass computes both, with the same results."""
     models = []
     for shortcut in (True, False):
         settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}

@@ -1,4 +1,4 @@
-"""EqRRainbow's own parts, and the knobs of later work: each against numbers made by hand or by another way."""
+"""Components of EqRRainbow and options from later work, compared with hand-computed numbers or other implementations."""
 
 import math
 import warnings
@@ -26,7 +26,7 @@ make_rainbow = MAKERS[1]
 
 
 def hand_made_agent(**kwargs):
-    """Three atoms on [-1, 1], and heads whose outputs are their biases alone, whatever the state."""
+    """Three atoms on [-1, 1], and heads whose outputs are their biases in every state."""
     network = {"n_atoms": 3, "v_min": -1.0, "v_max": 1.0, "net_arch": [], "noisy": False, "group": None}
     settings = {"exploration_final_eps": 0.1, "prediction_depth": 0, **kwargs}
     policy_kwargs = {**network, **settings.pop("policy_kwargs", {})}
@@ -46,8 +46,8 @@ def set_head(stream, probabilities):
 @pytest.mark.parametrize("double_q, goal", [(True, [0.0, 0.375, 0.625]), (False, [0.0, 0.0, 1.0])])
 def test_double_q_by_hand(double_q, goal):
     """
-    The online network prefers action 0, the target network action 2. The return is 0.5 and γ to its length 0.5, so the
-    atoms -1, 0, 1 move to 0, 0.5, 1. Of action 0's (1/4, 1/4, 1/2), the middle is halved between the atoms 0 and 1.
+    The online network prefers action 0, the target network action 2. The n-step return is 0.5 and γⁿ is 0.5, so the atoms
+    -1, 0, 1 move to 0, 0.5, 1. The middle one of action 0's (1/4, 1/4, 1/2) is shared equally by the atoms 0 and 1.
     """
     model = hand_made_agent(double_q=double_q, policy_kwargs={"dueling": False})
     sure_of_1 = [1e-30, 1e-30, 1.0]
@@ -63,14 +63,14 @@ def test_double_q_by_hand(double_q, goal):
     assert terms.td.item() == pytest.approx(cross_entropy, rel=1e-5)
     assert terms.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
     assert terms.q_values.item() == pytest.approx(-0.5 + 0.125)
-    terminal = loss_terms(model, samples._replace(dones=one))  # all mass on 0.5: half to 0, half to 1
+    terminal = loss_terms(model, samples._replace(dones=one))  # all the mass is at 0.5: half goes to 0, half to 1
     assert terminal.td.item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
 
 
 def test_dueling_by_hand():
     """
     Value logits (ln 2, 0, 0); advantages (ln 2, 0, 0), 0 and 0, with the mean (ln 2 / 3, 0, 0). So the logits of atom -1
-    are 5/3 ln 2 for action 0 and 2/3 ln 2 for the others, and all else is 0.
+    are 5/3 ln 2 for action 0 and 2/3 ln 2 for the others, and all other logits are 0.
     """
     model = hand_made_agent(policy_kwargs={"dueling": True})
     set_head(model.q_net.head.value, [[2.0, 1.0, 1.0]])
@@ -84,7 +84,7 @@ def test_dueling_by_hand():
     assert model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0] in (1, 2)
 
 
-def test_q_values_are_expectations_of_the_log_probabilities():
+def test_q_values_are_expectations_over_the_probabilities():
     model = make_rainbow(ChainEnv(), policy_kwargs={"v_min": -3.0, "v_max": 5.0}).learn(60)
     obs = th.randn(7, 3)
     with th.no_grad():
@@ -100,7 +100,7 @@ def test_q_values_are_expectations_of_the_log_probabilities():
 
 
 def test_the_return_distribution_is_learned():
-    """One state, one step: reward 1 with probability 1/4, else -1. A point estimate would say -0.5."""
+    """One state, one step: reward 1 with probability 1/4, else -1. A point estimate would be -0.5."""
 
     class Coin(ChainEnv):
         def step(self, action):
@@ -120,7 +120,7 @@ def test_the_return_distribution_is_learned():
 # ---------------------------------------------------------------------------------------------- exploration
 
 
-def test_noise_explores_in_eval_mode_and_differs_from_step_to_step():
+def test_noise_explores_in_eval_mode_and_changes_at_every_step():
     model = make_rainbow(ChainEnv(), learning_starts=0, exploration_initial_eps=0.0).learn(20)
     model.policy.set_training_mode(False)  # as collect_rollouts does
     obs = np.zeros((1, 3), dtype=np.float32)
@@ -138,7 +138,7 @@ def test_acting_with_the_target_network():
     obs = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
     with th.no_grad():
         online, target = (net(th.as_tensor(obs)).argmax(dim=1).numpy() for net in (model.q_net, model.q_net_target))
-    assert (online != target).any()  # or nothing is shown here
+    assert (online != target).any()  # otherwise the test proves nothing
     assert np.array_equal(model.predict(obs, deterministic=True)[0], target)
     model.policy.act_with_target = False
     assert np.array_equal(model.predict(obs, deterministic=True)[0], online)
@@ -147,8 +147,8 @@ def test_acting_with_the_target_network():
 # ---------------------------------------------------------------------------------------------- schedules
 
 
-def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
-    """Every draw is watched: its n, its γ, and whether the returns in it are those of that n and γ."""
+def test_the_buffer_uses_the_annealed_n_and_gamma(make, monkeypatch):
+    """Checks n and γ of every sample, and that its returns were computed with them."""
     resets = {"initial_n_steps": 8, "initial_gamma": 0.5, "annealing_steps": 10, "interval": 20}
     model = make(ChainEnv(), n_steps=2, gamma=0.95, resets=resets, seed=1)
     buffer, used = model.replay_buffer, []
@@ -181,13 +181,13 @@ def test_annealed_n_and_gamma_are_what_the_buffer_used(make, monkeypatch):
     assert {n for _, n, _ in used} == {8, 7, 6, 5, 4, 3, 2}
 
 
-def test_constant_n_and_gamma_are_left_alone(make):
+def test_constant_n_and_gamma_do_not_change(make):
     model = make(ChainEnv()).learn(60)
     assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.99)
 
 
 def test_importance_weights_of_bbf(make):
-    """β stays at 1/2: weights are 1/√P over their maximum."""
+    """β stays at 1/2, so weights are 1/√P divided by their maximum."""
     model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.5, "final_beta": 0.5}).learn(50)
     assert model.replay_buffer.beta == 0.5
     samples = model.replay_buffer.sample(64)
@@ -196,7 +196,7 @@ def test_importance_weights_of_bbf(make):
     np.testing.assert_allclose(samples.weights, expected / expected.max(), rtol=1e-5)
 
 
-def test_beta_may_fall(make):
+def test_beta_may_decrease(make):
     model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.8, "final_beta": 0.2}).learn(50)
     assert model.replay_buffer.beta == pytest.approx(0.2)
     model._current_progress_remaining = 0.5
@@ -208,13 +208,13 @@ def test_beta_may_fall(make):
 
 
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
-def test_a_reset_to_the_last_bit(make, alpha, projection):
+def test_a_reset_bit_for_bit(make, alpha, projection):
     network = PAPER if projection == "head" else {"projection": projection}
     model = make(ChainEnv(), resets={"interval": 20, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(50)
-    assert model._n_updates == 20 and model._resets.done == []  # the next update comes after a reset
+    assert model._n_updates == 20 and model._resets.done == []  # a reset comes before the next update
     old = {name: p.clone() for name, p in model.policy.state_dict().items()}
     state = th.get_rng_state()
-    fresh = make(ChainEnv(), policy_kwargs=network)  # takes its seed: put the generator where the reset will find it
+    fresh = make(ChainEnv(), policy_kwargs=network)  # sets the seed, so restore the generator's state for the reset
     th.set_rng_state(state)
     drawn = type(model.policy)(model.observation_space, model.action_space, lambda _: 0.0, **fresh.policy_kwargs).state_dict()
     th.set_rng_state(state)
@@ -237,11 +237,11 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
             kinds["perturbed"] += 1
     assert min(kinds.values()) > 0
     assert len(model.policy.optimizer.state) == 0
-    for online_part, target_part in (*model.policy.target_copy.pairs, *model.policy.latent_target_copy.pairs):  # they follow
+    for online_part, target_part in (*model.policy.target_copy.pairs, *model.policy.latent_target_copy.pairs):
         for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
             assert th.equal(a, b)
     before = {name: p.clone() for name, p in new.items()}
-    model.learn(8, reset_num_timesteps=False)  # and training goes on
+    model.learn(8, reset_num_timesteps=False)  # training continues
     still = [n for n, p in model.policy.named_parameters() if p.requires_grad and th.equal(before[n], p)]
     assert still == [] and all(th.isfinite(p).all() for p in model.policy.parameters())
 
@@ -249,7 +249,7 @@ def test_a_reset_to_the_last_bit(make, alpha, projection):
 def test_when_resets_happen(make):
     model = make(ChainEnv(), resets={"interval": 12, "end": 0.7}).learn(90)  # 100 updates in steps 41 to 90
     assert model._n_updates == 100
-    assert model._resets.done == [12, 24, 36]  # 70 % of 90 steps are over after 46 updates
+    assert model._resets.done == [12, 24, 36]  # 70 % of the 90 steps are done after 46 updates
     assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)._resets.done == [
         7,
         14,
@@ -262,14 +262,14 @@ def test_when_resets_happen(make):
 
 
 def wait_for_a_longer_window(make):
-    """After 4 updates n is to jump from 2 to 60 by a reset, while the buffer has some 45 transitions."""
+    """A reset after 4 updates raises n from 2 to 60, while the buffer has about 45 transitions."""
     model = make(ChainEnv(), n_steps=2, resets={"interval": 4, "annealing_steps": 1}).learn(42)
     assert model._n_updates == 4
     model._resets.schedule = replace(model._resets.schedule, initial_n_steps=60)
     return model
 
 
-def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
+def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
     model = wait_for_a_longer_window(make)
     model.learn(8, reset_num_timesteps=False)
     assert model._n_updates == 4 and model._resets.done == [4]
@@ -278,8 +278,8 @@ def test_a_reset_that_has_to_wait_for_a_longer_window_is_made_once(make):
 
 
 @pytest.mark.usefixtures("backup_each_round")
-def test_rounds_without_updates_keep_the_last_sound_model(make):
-    """Something has spoilt the model, and rounds without updates lie between that and the moment when it is noticed."""
+def test_rounds_without_updates_keep_the_last_good_model(make):
+    """The model has become NaN, and some rounds without updates pass before this is noticed."""
     model = wait_for_a_longer_window(make)
     with th.no_grad():
         next(model.policy.online.features_extractor.parameters()).fill_(float("nan"))
@@ -289,15 +289,15 @@ def test_rounds_without_updates_keep_the_last_sound_model(make):
     model.learn(40, reset_num_timesteps=False)
 
 
-def test_resets_are_postponed_not_lost():
-    """Within the last tenth of one call of learn; the next call makes up for it."""
+def test_resets_are_postponed_to_the_next_call_of_learn():
+    """A reset due in the last tenth of a call of ``learn`` is done in the next call."""
     model = make_rainbow(ChainEnv(), resets={"interval": 30}).learn(60)
     assert (model._n_updates, model._resets.done) == (40, [])
     model.learn(40, reset_num_timesteps=False)
     assert model._resets.done == [40, 70]
 
 
-def test_what_is_frozen_is_not_perturbed():
+def test_resets_do_not_change_frozen_parameters():
     model = make_rainbow(ChainEnv(), resets={"interval": 6}, policy_kwargs={"net_arch": [32, 32]})
     frozen = [*model.q_net.features_extractor.parameters(), *model.q_net.head.value[0].parameters()]
     for parameter in frozen:
@@ -319,7 +319,7 @@ class PolicyWithAnArgument(EqRRainbowPolicy):
                 parameter.mul_(self.head_scale)
 
 
-def test_a_policy_of_ones_own_is_drawn_with_its_arguments():
+def test_a_reset_initialises_a_custom_policy_with_its_arguments():
     model = EqRRainbow(PolicyWithAnArgument, ChainEnv(), buffer_size=100, policy_kwargs={"head_scale": 0.0})
     model.set_logger(configure(None, []))
     model._reset()
@@ -327,8 +327,8 @@ def test_a_policy_of_ones_own_is_drawn_with_its_arguments():
 
 
 @pytest.mark.usefixtures("backup_each_round")
-def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch):
-    """The second update of the round in which the reset was made: back to its start, before the reset."""
+def test_a_bad_update_right_after_a_reset_reverts_the_reset(make, monkeypatch):
+    """The bad update is the second one of the round with the reset, so the model is restored to before the reset."""
     model = make(ChainEnv(), resets={"interval": 40}).learn(60)
     assert model._n_updates == 40 and model._resets.done == []
     good = {name: p.clone() for name, p in model.policy.state_dict().items()}
@@ -336,7 +336,7 @@ def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch)
     model._current_progress_remaining = 0.5
     add = model._monitor.add
 
-    def poisoned(metrics):  # at the end of the first update
+    def poisoned(metrics):  # called at the end of the first update
         add(metrics)
         model.replay_buffer.rewards[:] = 1e38
 
@@ -356,7 +356,7 @@ def test_a_bad_update_right_after_a_reset_puts_the_reset_back(make, monkeypatch)
     assert model._resets.done == [40] and all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
+def test_optimizer_state_cleared_by_a_reset_is_restored():
     layer = th.nn.Linear(2, 2)
     optimizer = th.optim.Adam(layer.parameters())
     layer(th.ones(1, 2)).sum().backward()
@@ -371,8 +371,8 @@ def test_optimizer_state_that_a_reset_has_cleared_is_put_back():
     assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2
 
 
-def test_backups_are_as_old_as_they_may_be():
-    """Rounds of 20 updates, a backup every 50 or more: at 0, 60, 120."""
+def test_the_interval_of_backups():
+    """With rounds of 20 updates, and a backup after at least 50, backups are at 0, 60 and 120."""
     layer = th.nn.Linear(1, 1)
     monitor = UpdateMonitor(layer, th.optim.SGD(layer.parameters()))
 
@@ -395,8 +395,8 @@ def test_backups_are_as_old_as_they_may_be():
 
 
 @pytest.mark.parametrize("name", ["AdamW", th.optim.AdamW])
-def test_weight_decay_reaches_matrices_only(make, name):
-    """With a learning rate of 1, no gradient and a decay of 1/4, one step leaves 3/4 of what decays."""
+def test_weight_decay_applies_to_matrices_only(make, name):
+    """With a learning rate of 1, no gradient and a decay of 1/4, one step leaves 3/4 of the decayed weights."""
     network = {"optimizer_class": name, "optimizer_kwargs": {"eps": 1.5e-4, "weight_decay": 0.25}}
     model = make(ChainEnv(), learning_rate=1.0, policy_kwargs=network)
     optimizer = model.policy.optimizer
@@ -409,7 +409,7 @@ def test_weight_decay_reaches_matrices_only(make, name):
     assert {p.ndim for p in model._trained} == {1, 2}
     parts = [model.policy.online, model.policy.latent_model, model.policy.own_projection]
     for key, p in [named for part in parts for named in part.named_parameters()]:
-        assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # noise would die out
+        assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # decay would remove the noise
     trained = {id(p) for group in optimizer.param_groups for p in group["params"]}
     assert trained == {id(p) for part in parts for p in part.parameters()}
     model.set_logger(configure(None, []))
@@ -418,8 +418,8 @@ def test_weight_decay_reaches_matrices_only(make, name):
     assert {group["lr"] for group in optimizer.param_groups} == {0.125}
 
 
-def test_impala_is_the_network_of_the_paper():
-    """Espeholt et al. 2018: 15 convolutions in 3 stages, pooled by 2 each; counted by hand."""
+def test_impala_follows_the_paper():
+    """Espeholt et al. 2018: 15 convolutions in 3 stages, each with a pooling by 2; parameters counted by hand."""
     trunk = ImpalaTrunk(4)
     convolutions = [m for m in trunk.modules() if isinstance(m, th.nn.Conv2d)]
     assert len(convolutions) == 15
@@ -456,13 +456,13 @@ def test_trunks_by_name(make, group, network):
     trunk = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}}
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **trunk, "group": group}, symmetry_coef=0.0).learn(60)
     encoder = model.policy.online.features_extractor
-    alone = network is PAPER and group is None  # neither a norm nor group elements behind it
+    alone = network is PAPER and group is None  # followed by neither a norm nor group elements
     assert isinstance(encoder if alone else encoder.trunk, ImpalaExtractor)
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-def test_filters_of_ones_own():
-    """The two 5x5 convolutions of data-efficient Rainbow."""
+def test_custom_filters():
+    """Such as the two 5x5 convolutions of data-efficient Rainbow."""
     space = ImageEnv((4, 84, 84)).observation_space
     extractor = ConvExtractor(space, layers=[[32, 5, 5], [64, 5, 5]])
     assert extractor.features_dim == 64 * 3 * 3
@@ -470,7 +470,7 @@ def test_filters_of_ones_own():
         ConvExtractor(ImageEnv((4, 24, 24)).observation_space, layers=[[32, 5, 5], [64, 5, 5]])
 
 
-def test_no_warning_of_greed_where_resets_explore():
+def test_no_warning_about_greedy_exploration_with_resets():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_rainbow(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})

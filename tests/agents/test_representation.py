@@ -1,4 +1,4 @@
-"""Representation learning alone: no Q-learning, no reward, random actions; and the switches that it is made of."""
+"""Representation learning alone, without Q-learning and reward, on random actions; and its options."""
 
 import warnings
 
@@ -21,7 +21,7 @@ STEPS = 12  # around the ring
 
 
 class Ring(gym.Env):
-    """A point on a ring, seen through a fixed random mixture of harmonics: no coordinate is the angle's sine or cosine."""
+    """A point on a ring, seen as a fixed random mixture of harmonics, so no coordinate is the sine or cosine of its angle."""
 
     def __init__(self):
         self.observation_space = spaces.Box(-np.inf, np.inf, (12,), np.float32)
@@ -32,7 +32,7 @@ class Ring(gym.Env):
 
     def see(self, angle):
         harmonics = np.concatenate([[np.cos(k * angle), np.sin(k * angle)] for k in (1, 2, 3)])
-        return (5 + harmonics @ self.mixing).astype(np.float32)  # a constant that dwarfs what changes
+        return (5 + harmonics @ self.mixing).astype(np.float32)  # a constant much larger than the variation
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -72,12 +72,12 @@ def test_the_ring_is_found(seed):
     rest = np.angle(np.exp(1j * (rest - np.angle(np.exp(1j * rest).mean()))))
     assert 1 - rest.var() / (np.pi**2 / 3) > 0.99
     with th.no_grad():
-        table = model.policy.latent_model.transition(th.eye(2))[:, 0] / (2 * np.pi / STEPS)  # angles of the actions, in steps
+        table = model.policy.latent_model.transition(th.eye(2))[:, 0] / (2 * np.pi / STEPS)  # the actions' angles in steps
     assert abs(table[0] + table[1]) < 0.02 and abs(abs(table[0]) - 1) < 0.05
 
 
 @pytest.mark.slow
-def test_the_example_as_stated_collapses_and_that_is_told():
+def test_the_papers_example_collapses_with_a_warning():
     with pytest.warns(UserWarning, match="states and actions are nearly constant.*collapsed"):
         train(0, 1500, parameterization="euler", whiten=False, aet_loss="distance", still_timesteps=0, learning_rate=1e-2)
 
@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_representation():
         assert th.equal(value, other), name
 
 
-def test_without_q_learning_the_head_stays_and_nothing_of_it_is_logged(make):
+def test_without_q_learning_the_head_is_neither_trained_nor_logged(make):
     model = make(ChainEnv(), td_coef=0.0, policy_kwargs={"projection": "own"})
     head = [p.clone() for p in model.policy.online.head.parameters()]
     encoder = [p.clone() for p in model.policy.online.features_extractor.parameters()]
@@ -97,11 +97,11 @@ def test_without_q_learning_the_head_stays_and_nothing_of_it_is_logged(make):
     assert not any(th.equal(p, q) for p, q in zip(model.policy.online.features_extractor.parameters(), encoder, strict=True))
     logged = model.logger.name_to_value
     assert "train/aet_loss" in logged and "train/td_loss" not in logged and "train/mean_q_value" not in logged
-    assert model.replay_buffer._max_priority == 1.0  # no TD error: priorities stay
+    assert model.replay_buffer._max_priority == 1.0  # without TD errors the priorities do not change
 
 
 def test_weight_of_the_td_loss(make):
-    """The loss is the sum of its parts with their weights."""
+    """The loss is the weighted sum of its terms."""
     model = make(ChainEnv(), td_coef=0.5, aet_coef=2.0, prioritized_replay=False)
     model.learn(41)
     logged = {
@@ -137,7 +137,7 @@ def test_actions_that_do_not_depend_on_the_state():
     ],
     ids=str,
 )
-def test_the_switches_train_and_are_saved(make, settings, tmp_path):
+def test_every_option_trains_and_is_saved(make, settings, tmp_path):
     model = make(ChainEnv(), **settings).learn(44)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
@@ -147,7 +147,7 @@ def test_the_switches_train_and_are_saved(make, settings, tmp_path):
     loaded.learn(44)
 
 
-def test_what_is_not_legal():
+def test_invalid_arguments():
     with pytest.raises(ValueError, match=r"aet_loss must be one of .*contrastive.*got 'nce'"):
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"aet_loss": "nce"})
     with pytest.raises(ValueError, match=r"projection must be one of .*got 'mine'"):
@@ -163,7 +163,7 @@ def test_what_is_not_legal():
 
 
 @pytest.mark.parametrize("group", ["GL(2)", "SE(2)", "GL(2) x SO(2)"])
-def test_actions_stay_the_identity_at_first_and_are_let_go(group):
+def test_actions_are_the_identity_until_still_timesteps(group):
     found = []
 
     def look(local, _):

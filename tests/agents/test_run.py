@@ -1,4 +1,4 @@
-"""What sb3-contrib's suite asks of QRDQN, asked of every EqR agent: running, spaces, modes, callbacks, loggers."""
+"""What sb3-contrib tests for QRDQN, tested for every EqR agent: training, spaces, modes, callbacks, loggers."""
 
 import re
 from copy import deepcopy
@@ -35,7 +35,7 @@ from tests.toys import ChainEnv, ImageEnv
 
 @BOTH
 @pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy", "MultiInputPolicy"])
-def test_every_policy_runs_and_every_part_learns(make, policy, network):
+def test_every_policy_runs_and_all_parameters_are_trained(make, policy, network):
     envs = {"MlpPolicy": ChainEnv, "CnnPolicy": ImageEnv, "MultiInputPolicy": SimpleMultiObsEnv}
     model = make(envs[policy](), policy, policy_kwargs=network)
     before = deepcopy(model.policy.state_dict())
@@ -80,19 +80,19 @@ def test_every_policy_runs_and_every_part_learns(make, policy, network):
     ],
     ids=lambda kwargs: re.sub(" at 0x\\w+", "", str(kwargs)),
 )
-def test_every_switch_runs(make, kwargs):
+def test_every_option_runs(make, kwargs):
     model = make(ChainEnv(), **kwargs).learn(62)
     assert model._n_updates > 0
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
 @pytest.mark.parametrize("env", [IdentityEnvBox(eps=0.5), IdentityEnvMultiBinary(), IdentityEnvMultiDiscrete()])
-def test_wrong_action_spaces_are_refused(make, env):
+def test_wrong_action_spaces_raise(make, env):
     with pytest.raises(AssertionError, match="Wrap the environment with discrete actions"):
         make(env)
 
 
-def test_actions_that_do_not_count_from_0_are_refused(make):
+def test_actions_that_do_not_start_at_0_raise(make):
     env = ChainEnv()
     env.action_space = spaces.Discrete(3, start=1)
     with pytest.raises(AssertionError, match="TransformAction"):
@@ -107,27 +107,27 @@ def test_several_environments(make, n_envs):
         make(make_vec_env(ChainEnv, 2), train_freq=(1, "episode")).learn(10)
 
 
-def test_the_callers_dictionaries_are_left_alone(make):
+def test_the_callers_dictionaries_are_not_changed(make):
     policy_kwargs, buffer_kwargs = {"net_arch": [16]}, {"handle_timeout_termination": False}
     model = make.algorithm("MlpPolicy", ChainEnv(), **SMALL, policy_kwargs=policy_kwargs, replay_buffer_kwargs=buffer_kwargs)
     model.learn(46)
     assert policy_kwargs == {"net_arch": [16]} and buffer_kwargs == {"handle_timeout_termination": False}
     assert model.policy.optimizer.defaults["eps"] == 1.5e-4  # Table 5
-    for name, expected in (("AdamW", 1.5e-4), (th.optim.Adam, 1.5e-4), ("RAdam", 1e-8)):  # RAdam: torch's own
+    for name, expected in (("AdamW", 1.5e-4), (th.optim.Adam, 1.5e-4), ("RAdam", 1e-8)):  # RAdam keeps PyTorch's default
         named = make(ChainEnv(), policy_kwargs={"optimizer_class": name})
         assert named.policy.optimizer.defaults["eps"] == expected
     own = make(ChainEnv(), policy_kwargs={"optimizer_kwargs": {"betas": (0.5, 0.9)}})
     assert own.policy.optimizer.defaults["betas"] == (0.5, 0.9) and own.policy.optimizer.defaults["eps"] == 1.5e-4
 
 
-def test_the_learning_rate_schedule_reaches_the_latent_model(make):
+def test_the_learning_rate_schedule_applies_to_the_latent_model(make):
     model = make(ChainEnv(), learning_rate=lambda progress: 1e-3 * progress).learn(50)
     (group,) = model.policy.optimizer.param_groups
     assert group["lr"] == 0.0 and {*map(id, model.policy.latent_model.parameters())} <= {*map(id, group["params"])}
 
 
 def test_defaults_are_those_of_table_5(make):
-    """And those of docs/gradients.md, in place of the paper's encoder."""
+    """Or of docs/gradients.md, where they differ from the paper."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
     model = make.algorithm("CnnPolicy", env, device="cpu")
     assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
@@ -151,7 +151,7 @@ def test_defaults_are_those_of_table_5(make):
     for policy, n_features, sigma_init in ((model.policy, 3136, 0.1), (papers, 72, 0.5)):
         head, layer = policy.online.head, policy.group_layer
         assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], sigma_init) and head.value is not None
-        # σ₀ over the square root of the inputs
+        # σ₀ divided by the square root of the number of inputs
         assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(sigma_init / n_features**0.5)
         assert (str(layer.group), layer.n_blocks, policy.state_dim) == ("SE(2)", 12, 72)
         assert policy.online.features_extractor.features_dim == n_features
@@ -194,7 +194,7 @@ def test_images_channels_first_and_last(make, shape):
     assert model.predict(first[None], deterministic=True)[0].tolist() == [action]
 
 
-def test_group_keywords_reach_a_given_group_encoder(make):
+def test_a_given_group_encoder_gets_the_group_arguments(make):
     own = {**PAPER, "features_extractor_class": GroupFeaturesExtractor, "group": "SO(3)", "n_blocks": 2}
     encoder = make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor
     assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks) == ("SO(3)", 2)
@@ -203,10 +203,10 @@ def test_group_keywords_reach_a_given_group_encoder(make):
     assert make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": None}).policy.latent_model.n_blocks == 32  # Table 5
 
 
-def test_images_that_are_floats_already(make):
+def test_float_images(make):
     env = ImageEnv((3, 40, 36), dtype=np.float32)
     model = make(env, "CnnPolicy", policy_kwargs={"normalize_images": False}).learn(46)
-    assert model.objective.augment.image_keys == [""]  # augmented like the others
+    assert model.objective.augment.image_keys == [""]  # augmented like other images
     policy_kwargs = {**PAPER, "normalize_images": False, "features_extractor_class": GroupFeaturesExtractor}
     encoder = make(env, "CnnPolicy", policy_kwargs=policy_kwargs).policy.online.features_extractor
     assert isinstance(encoder.trunk, ConvExtractor)
@@ -248,7 +248,7 @@ def test_a_custom_extractor_becomes_the_trunk(make, network):
     assert isinstance(encoder, GroupFeaturesExtractor if network is PAPER else NormalizedExtractor)
     assert isinstance(encoder.trunk, TinyExtractor)
     assert policy.group_layer.to_algebra.in_features == 7
-    # Batch norm: online features in train mode are no target features.
+    # With batch norm, online features in train mode differ from target features.
     assert not policy.target_encodes_as_online and not policy.latent_target_encodes_as_online
     assert policy.latent_target is not policy.online
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, "features_extractor_class": NatureCNN}).learn(46)
@@ -259,7 +259,7 @@ def test_a_custom_extractor_becomes_the_trunk(make, network):
 @pytest.mark.parametrize(
     "env, policy", [(ChainEnv, "MlpPolicy"), (ImageEnv, "CnnPolicy"), (SimpleMultiObsEnv, "MultiInputPolicy")]
 )
-def test_the_group_encoder_serves_stock_algorithms(algorithm, env, policy):
+def test_the_group_encoder_works_with_stock_algorithms(algorithm, env, policy):
     policy_kwargs = {
         "features_extractor_class": GroupFeaturesExtractor,
         "features_extractor_kwargs": {"group": "SO(3)", "n_blocks": 4},
@@ -298,7 +298,7 @@ def test_multi_discrete_and_multi_binary_observations(make, space):
     assert make(Env()).learn(80)._n_updates > 0
 
 
-def test_dict_observations_are_augmented_where_they_are_images(make):
+def test_images_in_dict_observations_are_augmented(make):
     model = make(SimpleMultiObsEnv(channel_last=True), "MultiInputPolicy")
     assert model.objective.augment.image_keys == ["img"]
     model.learn(46)
@@ -310,14 +310,14 @@ def test_dict_observations_are_augmented_where_they_are_images(make):
 
 
 @EITHER
-def test_frame_stacks_are_found_and_stored_once(make):
+def test_frame_stacks_are_detected_and_each_frame_is_stored_once(make):
     env = VecFrameStack(make_vec_env(ImageEnv, 2), 4)
     model = make(env, "CnnPolicy", buffer_size=400).learn(100)
     assert model.frame_stack == 4 and model.replay_buffer.nbytes / 400 < 1.3 * 36 * 36
     whole = make(env, "CnnPolicy", buffer_size=400, replay_buffer_kwargs={"frame_stack": 1}).learn(100)
     assert whole.frame_stack == 1
     sideways = VecFrameStack(make_vec_env(lambda: ImageEnv((1, 40, 36))), 2, channels_order="last")
-    assert make(sideways, "CnnPolicy").frame_stack == 1  # frames lie side by side along the width
+    assert make(sideways, "CnnPolicy").frame_stack == 1  # frames are concatenated along the width
     np.random.seed(0)
     a = model.replay_buffer.sample(200)
     np.random.seed(0)
@@ -328,7 +328,7 @@ def test_frame_stacks_are_found_and_stored_once(make):
 # ---------------------------------------------------------------------------------------------- modes
 
 
-def test_batch_norm_moves_in_training_only(make):
+def test_batch_norm_statistics_change_in_training_only(make):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"features_extractor_class": TinyExtractor}, learning_starts=30)
 
     def statistics():
@@ -336,7 +336,7 @@ def test_batch_norm_moves_in_training_only(make):
 
     start = statistics()
     assert len(start) > 0
-    model.learn(25)  # no update yet: collecting must not move them
+    model.learn(25)  # no update yet, and collecting must not change them
     obs = model.get_env().reset()
     for _ in range(3):
         model.predict(obs, deterministic=True)
@@ -350,7 +350,7 @@ def test_batch_norm_moves_in_training_only(make):
     assert all(th.equal(a, b) for a, b in zip(trained, statistics(), strict=True))
 
 
-def test_train_mode_reaches_all_that_is_trained_and_nothing_else(make):
+def test_train_mode_applies_to_the_trained_networks_only(make):
     policy = make(ChainEnv()).policy
     for mode in (True, False):
         policy.set_training_mode(mode)
@@ -360,13 +360,13 @@ def test_train_mode_reaches_all_that_is_trained_and_nothing_else(make):
 
 
 @BOTH
-def test_the_one_target_copy_follows(make, network):
+def test_target_networks_follow_the_online_ones(make, network):
     policy = make(ChainEnv(), policy_kwargs=network).learn(80).policy
     pairs = policy.target_copy.pairs
     if network is PAPER:
-        assert len(pairs) == 3 and policy.latent_target_copy is policy.target_copy  # encoder with Q head, κ, b
+        assert len(pairs) == 3 and policy.latent_target_copy is policy.target_copy  # the encoder with the Q head, κ, b
     else:
-        assert len(pairs) == 1 and len(policy.latent_target_copy.pairs) == 4  # p, to group elements, κ, b
+        assert len(pairs) == 1 and len(policy.latent_target_copy.pairs) == 4  # p, the map to group elements, κ, b
         pairs = [*pairs, *policy.latent_target_copy.pairs]
     for online, target in pairs:
         for a, b in zip(online.state_dict().values(), target.state_dict().values(), strict=True):
@@ -387,7 +387,7 @@ def test_exploration_is_random_then_noisy_and_prediction_is_neither(make):
     model = make(ChainEnv(), learning_starts=0, exploration_fraction=0.5)
     model.policy.online.head.advantage[-1].weight_sigma.data.fill_(1.0)
     model.learn(20)
-    assert model.exploration_rate == 0.0  # ε has come down; only noise explores
+    assert model.exploration_rate == 0.0  # ε is 0, so only the noise explores
     obs = np.zeros((1, 3), dtype=np.float32)
     model.policy.set_training_mode(False)  # as collect_rollouts does
     noisy = {int(model.predict(obs, deterministic=False)[0][0]) for _ in range(60)}
@@ -401,14 +401,14 @@ def test_beta_and_counters(make):
     model = make(ChainEnv(), train_freq=1, gradient_steps=3, learning_starts=50, replay_buffer_kwargs={"beta": 0.4})
     model.learn(60)
     assert model._n_updates == 3 * 10
-    # The last update was made when all steps were done, so β has reached 1.
+    # The last update comes after the last step, when β is 1.
     assert model.replay_buffer.beta == pytest.approx(1.0)
     model._current_progress_remaining = 0.5
     model.train(1, 8)
     assert model.replay_buffer.beta == pytest.approx(0.7)
 
 
-def test_a_schedule_may_move_n_and_gamma(make):
+def test_n_and_gamma_may_change_during_training(make):
     model = make(ChainEnv()).learn(46)
     model.n_steps, model.gamma = 2, 0.5
     model.train(1, 8)
@@ -421,8 +421,8 @@ def test_a_schedule_may_move_n_and_gamma(make):
 
 
 @BOTH
-def test_singular_states_of_gl_neither_stop_nor_poison_a_run(make, network):
-    """Every state the zero matrix: no inverse anywhere."""
+def test_a_run_with_singular_states_of_gl_stays_finite(make, network):
+    """Every state is the zero matrix, so no state has an inverse."""
     model = make(ChainEnv(), policy_kwargs={**network, "group": "GL(2)"})
     policy, to_algebra = model.policy, model.policy.group_layer.to_algebra
     th.nn.init.zeros_(to_algebra.weight)
@@ -505,7 +505,7 @@ def test_eval_and_checkpoint_callbacks(make, tmp_path):
 # ---------------------------------------------------------------------------------------------- logger
 
 
-def test_logger_has_every_key_and_reads_only_when_dumped(make, tmp_path, monkeypatch):
+def test_logger_has_every_key(make, tmp_path, monkeypatch):
     model = make(ChainEnv(length=10))
     model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
     reads = []
@@ -521,7 +521,7 @@ def test_logger_has_every_key_and_reads_only_when_dumped(make, tmp_path, monkeyp
     assert all(np.isfinite(recorded[key]) and isinstance(recorded[key], (float, int)) for key in keys)
 
 
-def test_logged_figures_are_means_over_the_updates_since_the_last_dump(make):
+def test_logged_metrics_are_means_over_the_updates_since_the_last_dump(make):
     model = make(ChainEnv())
     model.set_logger(configure(None, []))
     for values in ((1.0, 3.0), (5.0, 7.0)):
@@ -536,8 +536,8 @@ def test_logged_figures_are_means_over_the_updates_since_the_last_dump(make):
     assert not any("train/" in key for key in model.logger.name_to_value)
 
 
-def test_losses_are_seen_by_callbacks_that_dump_themselves(make, tmp_path):
-    """EvalCallback calls logger.dump: what training has recorded by then goes with it, as with QRDQN."""
+def test_callbacks_that_dump_the_logger_write_the_losses(make, tmp_path):
+    """EvalCallback calls logger.dump, which also writes what training has recorded, as with QRDQN."""
     model = make(ChainEnv())
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(

@@ -1,4 +1,4 @@
-"""Saving, loading, going on, and files that are not what they should be."""
+"""Saving, loading, resuming, and wrong or damaged files."""
 
 import base64
 import io
@@ -48,7 +48,7 @@ def test_save_and_load(make, policy, env, switches, tmp_path):
     assert a["param_groups"] == b["param_groups"]
     for key, state in a["state"].items():
         assert equal_states(state, b["state"][key])
-    loaded.learn(44)  # and on
+    loaded.learn(44)  # training continues
     assert make.algorithm.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
 
 
@@ -66,16 +66,16 @@ def test_save_and_load_by_file_object(make):
 
 
 @EITHER
-def test_checkpoints_made_in_the_middle_of_a_step_go_on(make, tmp_path):
+def test_checkpoints_made_in_the_middle_of_a_step_can_be_resumed(make, tmp_path):
     make(ChainEnv()).learn(120, callback=CheckpointCallback(50, str(tmp_path), save_replay_buffer=True))
     model = make.algorithm.load(tmp_path / "rl_model_100_steps", env=ChainEnv())
     model.load_replay_buffer(tmp_path / "rl_model_replay_buffer_100_steps")
     model.learn(50, reset_num_timesteps=False)
     assert model.num_timesteps == 150 and model.replay_buffer.size() == 99 + 50
-    assert model.replay_buffer.timeouts[98, 0] or model.replay_buffer.dones[98, 0]  # the episode was cut there
+    assert model.replay_buffer.timeouts[98, 0] or model.replay_buffer.dones[98, 0]  # the episode was truncated there
 
 
-def test_attributes_can_be_left_out_and_put_in(make, tmp_path):
+def test_attributes_can_be_excluded_and_added(make, tmp_path):
     model = make(ChainEnv())
     model.save(tmp_path / "a", exclude=["learning_rate"])
     model.custom = 3
@@ -86,7 +86,7 @@ def test_attributes_can_be_left_out_and_put_in(make, tmp_path):
 
 
 @EITHER
-def test_switches_can_be_changed_on_loading(make, tmp_path):
+def test_options_can_be_changed_on_loading(make, tmp_path):
     make(ChainEnv()).save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv(), prioritized_replay=False, n_steps=5)
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
@@ -104,7 +104,7 @@ def test_switches_can_be_changed_on_loading(make, tmp_path):
     assert loss_terms(richer, richer.replay_buffer.sample(8)).aet.shape == (8,)
 
 
-def test_another_seed_may_be_given_on_loading(make, tmp_path):
+def test_a_different_seed_can_be_passed_to_load(make, tmp_path):
     make(ChainEnv(), seed=0).learn(50).save(tmp_path / "model")
     draws = []
     for kwargs in ({}, {}, {"seed": 1}, {"seed": 2}):
@@ -113,7 +113,7 @@ def test_another_seed_may_be_given_on_loading(make, tmp_path):
     assert draws[0] == draws[1] and len(set(draws)) == 3
 
 
-def test_a_target_that_is_no_copy_is_not_taken_for_one(make, tmp_path):
+def test_a_loaded_target_that_differs_is_not_treated_as_a_copy(make, tmp_path):
     model = make(ChainEnv(), tau=0.005).learn(46)
     assert not model.policy.target_encodes_as_online
     model.save(tmp_path / "model")
@@ -123,7 +123,7 @@ def test_a_target_that_is_no_copy_is_not_taken_for_one(make, tmp_path):
     assert loaded.policy.target_encodes_as_online
 
 
-def test_set_env_and_other_numbers_of_environments(make, tmp_path):
+def test_set_env_and_different_numbers_of_environments(make, tmp_path):
     model = make(make_vec_env(ChainEnv, 2)).learn(46)
     model.set_env(make_vec_env(ChainEnv, 2))
     model.learn(60, reset_num_timesteps=False)
@@ -177,7 +177,7 @@ def test_policies_alone(make, policy, env, tmp_path):
     assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
 
 
-def test_a_group_of_ones_own_is_saved(make, tmp_path):
+def test_a_custom_group_is_saved(make, tmp_path):
     group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
     model = make(ChainEnv(), policy_kwargs={"group": group}).learn(46)
     model.save(tmp_path / "model")
@@ -185,7 +185,7 @@ def test_a_group_of_ones_own_is_saved(make, tmp_path):
     assert str(loaded.policy.latent_model.group) == str(group)
 
 
-def test_replay_buffer_goes_with_the_model(make, tmp_path):
+def test_a_loaded_replay_buffer_replaces_the_models(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")
     old = model.replay_buffer
@@ -195,7 +195,7 @@ def test_replay_buffer_goes_with_the_model(make, tmp_path):
     model.learn(60, reset_num_timesteps=False)
 
 
-KNOBS = {  # two resets after the file is written, one before; n and γ on their way
+KNOBS = {  # one reset before the file is written and two after; n and γ are being annealed
     "resets": {"interval": 30, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 45},
     "tau": 0.05,
     "policy_kwargs": {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}},
@@ -207,8 +207,8 @@ KNOBS = {  # two resets after the file is written, one before; n and γ on their
     [(MAKERS[0], False, {}), (MAKERS[1], True, {}), (MAKERS[1], False, KNOBS)],
     indirect=["make"],
 )
-def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, tmp_path):
-    """Saved after 80 of 160 steps, loaded in a new process, continued: the same parameters to the last bit."""
+def test_a_resumed_run_equals_an_uninterrupted_one(make, normalize, knobs, tmp_path):
+    """Saved after 80 of 160 steps, loaded and continued in a new process, it has the same parameters, bit for bit."""
     model = make(make_env(normalize), buffer_size=120, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
     model.learn(160, callback=Save(tmp_path, at=80))
     command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "80"]
@@ -230,14 +230,14 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(make, normalize, knobs, 
 def test_a_file_of_another_class(make, tmp_path):
     for algorithm in (QRDQN, DQN):
         algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
-        for trust in (False, True):  # no invitation to run its pickles for nothing
+        for trust in (False, True):  # the error must not suggest trusting a file that cannot be loaded
             with pytest.raises(
                 ValueError, match=r"stock: expected a file of EqR\w+\.save, found an agent whose policy is of \S+qn"
             ):
                 make.algorithm.load(tmp_path / "stock", env=ChainEnv(), trust=trust)
 
 
-def test_the_agents_do_not_take_each_others_files(tmp_path):
+def test_the_agents_reject_each_others_files(tmp_path):
     EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "quantiles")
     with pytest.raises(ValueError, match=r"expected a policy derived from EqRRainbowPolicy, found .*EqRQRDQNPolicy"):
         EqRRainbow.load(tmp_path / "quantiles")
@@ -256,7 +256,7 @@ def test_parameters_for_another_support(tmp_path):
 
 
 def test_parameters_of_another_group(make, tmp_path):
-    """SE(2) with 4 blocks and GL(2) with 3 have algebras of the same size."""
+    """SE(2) with 4 blocks and GL(2) with 3 blocks have Lie algebras of the same size."""
     model = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4}, prediction_depth=0)
     other = make(ChainEnv(), policy_kwargs={"group": "T(2)", "n_blocks": 18}, prediction_depth=0)
     twisted = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4, "parameterization": "exp"}, prediction_depth=0)
@@ -273,7 +273,7 @@ def test_parameters_of_another_group(make, tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_checkpoints_cut_off_halfway(make, share, tmp_path):
+def test_truncated_files(make, share, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
@@ -288,7 +288,7 @@ def test_checkpoints_cut_off_halfway(make, share, tmp_path):
     assert model.replay_buffer is buffer
 
 
-def test_a_flipped_byte_anywhere_is_seen(make, tmp_path):
+def test_a_flipped_byte_is_detected_anywhere(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")
     path, buffer = tmp_path / "buffer.pkl", model.replay_buffer
@@ -302,7 +302,7 @@ def test_a_flipped_byte_anywhere_is_seen(make, tmp_path):
     assert model.replay_buffer is buffer
 
 
-def test_a_buffer_is_loaded_where_there_is_none(make, tmp_path):
+def test_a_buffer_can_be_loaded_into_a_model_without_one(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")
     rewards, model.replay_buffer = model.replay_buffer.rewards.copy(), None
@@ -310,7 +310,7 @@ def test_a_buffer_is_loaded_where_there_is_none(make, tmp_path):
     assert (model.replay_buffer.rewards == rewards).all()
 
 
-def test_a_buffer_of_another_step_is_warned_of(make, tmp_path):
+def test_a_buffer_from_a_different_step_warns(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")
     with warnings.catch_warnings():
@@ -326,8 +326,8 @@ class Runs:
         return pathlib.Path.touch, (pathlib.Path("ran"),)
 
 
-def test_loading_runs_nothing(make, tmp_path, monkeypatch):
-    """Pickles in the place of every file, and inside a model."""
+def test_loading_executes_no_code(make, tmp_path, monkeypatch):
+    """Pickles in place of every file, and inside a model."""
     monkeypatch.chdir(tmp_path)
     model = make(ChainEnv()).learn(46)
     model.save("model")
@@ -343,7 +343,7 @@ def test_loading_runs_nothing(make, tmp_path, monkeypatch):
         for load in (make.algorithm.load, lambda path: make.algorithm.load(path, env=ChainEnv())):
             with pytest.raises(ValueError, match="pass trust=True"):
                 load("forged")
-        model.set_parameters("forged")  # reads no attributes
+        model.set_parameters("forged")  # does not read attributes
     with zipfile.ZipFile("weights.zip", "w") as archive:
         for member, content in members.items():
             archive.writestr(member, evil if member == "policy.pth" else content)
@@ -360,7 +360,7 @@ def test_loading_runs_nothing(make, tmp_path, monkeypatch):
     assert not pathlib.Path("ran").exists()
 
 
-def test_replay_buffers_of_others(make, tmp_path):
+def test_files_that_are_not_replay_buffers_of_this_package(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
     stock.save_replay_buffer(tmp_path / "stock")

@@ -1,4 +1,4 @@
-"""What enters the latent model, and the gradients that meet at the state."""
+"""The input of the latent model, and the two gradients at the state."""
 
 from copy import deepcopy
 
@@ -32,19 +32,20 @@ def test_layer_norm_gives_each_sample_mean_0_and_variance_1():
 
 
 @pytest.mark.parametrize("latent_tau", [None, 1.0])
-def test_the_head_sees_the_trunk_and_the_latent_model_makes_the_state(latent_tau):
+def test_the_head_sees_the_trunk_and_the_latent_model_computes_the_state(latent_tau):
     model = trained(policy_kwargs={**SMALL_NETWORK, "latent_tau": latent_tau}, target_update_interval=1_000)
     policy, layer = model.policy, model.policy.latent_model.embedding
     inputs = th.rand(5, 3)
     features = policy.online.features_extractor(inputs)
-    np.testing.assert_allclose(features.detach().std(dim=1, correction=0), 1, atol=2e-2)  # layer norm, and no more
+    np.testing.assert_allclose(features.detach().std(dim=1, correction=0), 1, atol=2e-2)  # layer norm only
     assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == features.shape[1] == 256
     elements = layer.group.element(layer.to_algebra(features).view(5, 4, 3)).flatten(1)
     assert th.equal(layer(features), elements)
-    assert th.equal(policy.latent_model_target.embedding(features), elements) is (latent_tau == 1.0)  # its copy moves with it
+    is_up_to_date = th.equal(policy.latent_model_target.embedding(features), elements)
+    assert is_up_to_date is (latent_tau == 1.0)
 
 
-def test_a_head_on_the_trunk_needs_a_projection_of_its_own():
+def test_a_head_on_the_trunk_needs_its_own_projection():
     with pytest.raises(ValueError, match=r"head_input must be one of"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"head_input": "both"})
     with pytest.raises(ValueError, match=r'projection: expected "own" or "none" beside head_input="trunk".*found "head"'):
@@ -55,12 +56,12 @@ def test_a_head_on_the_trunk_needs_a_projection_of_its_own():
 @pytest.mark.parametrize("share", [None, 0.05])
 @pytest.mark.parametrize("head_input", ["state", "trunk"])
 def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input):
-    """From the losses one by one: each alone gives its gradient at the state and at the encoder's weights."""
-    settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the one loss that draws partners
+    """Computed loss by loss: each one gives its gradient at the state and at the encoder's weights."""
+    settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the only loss that samples partners
     network = {"layer_norm": True, "projection": "own", "noisy": False, "head_input": head_input}
     model = trained(kind, **settings, policy_kwargs=network)
     policy, samples = model.policy, model.replay_buffer.sample(8)
-    weight = next(policy.online.features_extractor.parameters())  # of the trunk
+    weight = next(policy.online.features_extractor.parameters())  # the trunk's first weight
     states = []
     policy.online.features_extractor.register_forward_hook(
         lambda module, args, out: states.append(out) if out.requires_grad else None
@@ -75,7 +76,7 @@ def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind,
     of_auxiliary, auxiliary_weight, _ = gradients(0.0, 1.0, 1.0)
     ratio = (of_td.norm() / of_auxiliary.norm()).item()
     scale = 1.0 if share is None else min(1.0, share * ratio)
-    assert share is None or scale < 1  # or the test says nothing
+    assert share is None or scale < 1  # otherwise the test proves nothing
     _, found, terms = gradients(1.0, 1.0, 1.0)
     th.testing.assert_close(found, td_weight + scale * auxiliary_weight, rtol=1e-4, atol=1e-7)
     metrics = terms.metrics()
@@ -94,10 +95,10 @@ def test_the_gradients_are_logged():
 
 
 @pytest.mark.parametrize("latent_tau, whiten", [(1.0, False), (1.0, True), (0.25, False)])
-def test_the_latent_target_moves_by_itself(latent_tau, whiten):
+def test_the_latent_target_is_updated_separately(latent_tau, whiten):
     model = trained(policy_kwargs={"latent_tau": latent_tau, "whiten": whiten}, target_update_interval=1_000)
     policy = model.policy
-    assert (policy.latent_target is policy.online) == (latent_tau == 1.0 and not whiten)  # else it is a copy
+    assert (policy.latent_target is policy.online) == (latent_tau == 1.0 and not whiten)  # otherwise it is a copy
     q_target = [p.clone() for p in policy.target.parameters()]
     pairs = [(policy.online, policy.latent_target), *policy.latent_target_copy.pairs]
     parameters = [pair for online, target in pairs for pair in zip(online.parameters(), target.parameters(), strict=True)]
@@ -113,8 +114,8 @@ def test_the_latent_target_moves_by_itself(latent_tau, whiten):
 
 
 @pytest.mark.parametrize("head_input", ["trunk", "state"])
-def test_a_copied_latent_target_is_the_online_encoder(head_input, monkeypatch):
-    """With latent_tau=1 the online encoder gives x̄₀ ... x̄_M, and x̄₀ in the pass of x₀: shortcuts, not another algorithm."""
+def test_a_copied_latent_target_equals_the_online_encoder(head_input, monkeypatch):
+    """With latent_tau=1 the online encoder computes x̄₀ ... x̄_M, and x̄₀ together with x₀, with the same results."""
     states = []
     network = {"latent_tau": 1.0, "noisy": False, "head_input": head_input}
     for shortcut in (True, False):
@@ -131,7 +132,7 @@ def test_a_copied_latent_target_is_the_online_encoder(head_input, monkeypatch):
 
 
 @pytest.mark.parametrize("projection", ["head", "own", "none"])
-def test_the_predictor_stands_on_the_online_side_alone(projection):
+def test_the_predictor_is_on_the_online_side_only(projection):
     head_input = "state" if projection == "head" else "trunk"
     model = trained(policy_kwargs={"projection": projection, "predictor": True, "head_input": head_input})
     policy = model.policy
@@ -141,7 +142,7 @@ def test_the_predictor_stands_on_the_online_side_alone(projection):
     assert th.equal(policy.target_project(rows), same)  # a copy of the projection, without a predictor
 
 
-def test_spr_learns_saves_and_loads(tmp_path):
+def test_spr_trains_saves_and_loads(tmp_path):
     settings = {**SETTINGS, "aet_coef": 5.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
     policy_kwargs = {"group": None, "transition": "convolutional", "predictor": True, "latent_tau": 1.0}
     policy_kwargs |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]], "rescale": True}}
@@ -155,7 +156,7 @@ def test_spr_learns_saves_and_loads(tmp_path):
     assert (loaded.predict(observation, deterministic=True)[0] == model.predict(observation, deterministic=True)[0]).all()
 
 
-def test_a_convolutional_transition_needs_a_map():
+def test_a_convolutional_transition_needs_a_feature_map():
     with pytest.raises(ValueError, match=r"transition: expected group=None"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional"})
     with pytest.raises(ValueError, match=r'"convolutional" expected an image trunk.*found MlpExtractor'):
@@ -166,7 +167,7 @@ def test_a_convolutional_transition_needs_a_map():
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"transition": "linear"})
 
 
-def test_a_group_encoder_is_no_trunk():
+def test_a_group_encoder_cannot_be_a_trunk():
     policy_kwargs = {"features_extractor_class": GroupFeaturesExtractor}
     with pytest.raises(ValueError, match=r'expected a trunk, found a group encoder. Pass head_input="state"'):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=policy_kwargs)
@@ -186,8 +187,8 @@ def test_the_trunk_for_vectors():
 
 
 @pytest.mark.parametrize("configuration, low, high", [("default", 0.2, np.inf), ("paper", 0.0, 0.01)])
-def test_the_logits_of_a_new_agent_tell_frames_apart(configuration, low, high):
-    """Their spread over frames of Krull beside that over draws of noise (docs/gradients.md has three games)."""
+def test_the_logits_of_a_new_agent_depend_on_the_frames(configuration, low, high):
+    """Their spread over frames of Krull, compared with that over noise samples (docs/gradients.md has three games)."""
     arguments = {} if configuration == "default" else load_configuration(configuration)
     small = {"buffer_size": 400, "learning_starts": 300, "seed": 0}
     model = EqRRainbow("CnnPolicy", make_atari100k_env("Krull", seed=0), **{**arguments, **small}).learn(200)

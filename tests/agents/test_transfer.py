@@ -1,4 +1,4 @@
-"""A representation that goes from one run to another."""
+"""Transfer of a representation from one run to another."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ WHITENED = {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"
 
 
 def states(model):
-    """Copies of every part's parameters and statistics."""
+    """Copies of the parameters and statistics of every network of the representation."""
     return {name: {k: v.clone() for k, v in m.state_dict().items()} for name, m in representation(model.policy).items()}
 
 
@@ -24,7 +24,7 @@ def same(one, other):
 
 @BOTH
 @pytest.mark.parametrize("giver, taker", [(QRDQN, RAINBOW), (RAINBOW, QRDQN), (QRDQN, QRDQN)])
-def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, taker, network):
+def test_only_encoder_and_latent_model_are_transferred(tmp_path, giver, taker, network):
     network = {**WHITENED, **network}
     old = giver(ChainEnv(), policy_kwargs=network, seed=1).learn(46)
     old.save(tmp_path / "old")
@@ -47,10 +47,10 @@ def test_encoder_and_latent_model_are_taken_and_nothing_else(tmp_path, giver, ta
     assert not any(p in new.policy.optimizer.state for m in representation(new.policy).values() for p in m.parameters())
     before = states(new)
     new.learn(8, reset_num_timesteps=False)
-    assert not same(before, states(new))  # it trains on
+    assert not same(before, states(new))  # training continues
 
 
-def test_what_is_frozen_stays_through_training_saving_and_resets(make, tmp_path):
+def test_frozen_networks_survive_training_saving_and_resets(make, tmp_path):
     make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46).save(tmp_path / "old")
     model = make(ChainEnv(), policy_kwargs=WHITENED, resets={"interval": 6}).load_representation(tmp_path / "old", freeze=True)
     before, head = states(model), model.policy.online.head.advantage[0].weight.clone()
@@ -59,7 +59,7 @@ def test_what_is_frozen_stays_through_training_saving_and_resets(make, tmp_path)
     model.save(tmp_path / "new")
     loaded = make.algorithm.load(tmp_path / "new", env=ChainEnv())
     loaded.learn(46)
-    assert same(before, states(loaded)) and loaded._resets.done  # a reset leaves it, too
+    assert same(before, states(loaded)) and loaded._resets.done  # a reset does not change it either
     assert not th.equal(head, loaded.policy.online.head.advantage[0].weight)
 
 
@@ -74,7 +74,7 @@ def test_what_is_frozen_stays_through_training_saving_and_resets(make, tmp_path)
         ({"whiten": True}, "missing"),
     ],
 )
-def test_what_does_not_fit_changes_nothing(tmp_path, changes, found):
+def test_a_representation_that_does_not_fit_changes_nothing(tmp_path, changes, found):
     QRDQN(ChainEnv(), seed=1).save(tmp_path / "old")
     model = QRDQN(ChainEnv(), policy_kwargs=changes)
     before = states(model)
@@ -83,7 +83,7 @@ def test_what_does_not_fit_changes_nothing(tmp_path, changes, found):
     assert same(before, states(model))
 
 
-def test_another_kind_of_file(tmp_path):
+def test_a_different_kind_of_file(tmp_path):
     from sb3_contrib import QRDQN as Stock
 
     Stock("MlpPolicy", ChainEnv(), device="cpu").save(tmp_path / "stock")
@@ -94,7 +94,7 @@ def test_another_kind_of_file(tmp_path):
             algorithm("MlpPolicy", ChainEnv(), device="cpu").load_representation(tmp_path / "nothing")
 
 
-def test_what_was_frozen_can_be_let_go(make, tmp_path):
+def test_frozen_networks_can_be_unfrozen(make, tmp_path):
     make(ChainEnv(), policy_kwargs=WHITENED, seed=1).learn(46).save(tmp_path / "old")
     model = make(ChainEnv(), policy_kwargs=WHITENED).load_representation(tmp_path / "old", freeze=True).learn(45)
     before = states(model)
@@ -104,7 +104,7 @@ def test_what_was_frozen_can_be_let_go(make, tmp_path):
     assert not same(before, states(model))
 
 
-def test_files_that_are_no_agents(tmp_path):
+def test_files_that_are_not_agents(tmp_path):
     (tmp_path / "cut.zip").write_bytes(b"PK")
     with pytest.raises(ValueError, match="expected a whole file"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
@@ -113,8 +113,8 @@ def test_files_that_are_no_agents(tmp_path):
 
 
 @BOTH
-def test_states_are_the_same_in_another_agent(tmp_path, network):
-    """To the bit, wherever they are computed."""
+def test_states_are_the_same_in_the_new_agent(tmp_path, network):
+    """Bit for bit, wherever they are computed."""
     old = QRDQN(ChainEnv(), seed=1, policy_kwargs=network).learn(46)
     old.save(tmp_path / "old")
     new = RAINBOW(ChainEnv(), seed=5, policy_kwargs=network).load_representation(tmp_path / "old")

@@ -1,4 +1,4 @@
-"""One update, taken apart: targets, weights, priorities, the way of the gradient."""
+"""A single update in detail: targets, weights, priorities, gradients."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_quantile_td_loss_by_loops(double_q, dueling):
         now = model.policy.online(samples.observations).double().numpy()  # (16, 9, 3)
         online = model.policy.online(samples.next_observations).double().numpy()
         target = model.policy.target(samples.next_observations).double().numpy()
-    assert not np.allclose(online, target)  # or the test could not tell double Q
+    assert not np.allclose(online, target)  # otherwise the test could not detect double Q-learning
     chosen = set()
     for b in range(16):
         best = int(np.argmax((online if double_q else target)[b].mean(axis=0)))
@@ -51,11 +51,11 @@ def test_quantile_td_loss_by_loops(double_q, dueling):
 @pytest.mark.parametrize("double_q", [True, False])
 @pytest.mark.parametrize("dueling", [True, False])
 def test_categorical_td_loss_by_loops(double_q, dueling):
-    """Each atom of the target's distribution is moved, clipped and shared out by hand, in float64."""
+    """Each atom of the target distribution is moved, clipped and split by hand, in float64."""
     network = {"dueling": dueling, "v_min": -1.0, "v_max": 2.0}
     model = trained_model(MAKERS[1], double_q=double_q, policy_kwargs=network, prediction_depth=0, gamma=0.9)
     model.policy.set_training_mode(False)
-    with th.no_grad():  # a target that chooses other actions
+    with th.no_grad():  # a target network that chooses other actions
         for parameter in model.q_net_target.head.advantage[-1].parameters():
             parameter.neg_()
     samples = model.replay_buffer.sample(16)
@@ -86,7 +86,7 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
 
 @pytest.mark.parametrize("network", [PAPER, {}, {"latent_tau": 0.25}], ids=["paper", "default", "slow latent target"])
 def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, network):
-    """The online and target encodings of s_t, s_{t+1} ... s_{t+M}, each in its place."""
+    """The online and target encodings of s_t, s_{t+1} ... s_{t+M}, each in the right place."""
     model = trained_model(make, policy_kwargs=network)
     samples = model.replay_buffer.sample(8)
     seen = {}
@@ -103,7 +103,7 @@ def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, networ
 
     encoded = policy.latent_model.embedding(policy.online.features(samples.observations))
     th.testing.assert_close(state, encoded)
-    # Where the target is another network, its states are others, or the test says nothing.
+    # If the target is a different network, its states must differ, otherwise the test proves nothing.
     assert (policy.latent_target is policy.online) == (network == {})
     assert th.allclose(encoded, expected_states(samples.observations)) == (network == {})
     assert actions is samples.rollout_actions and rewards is samples.rollout_rewards and mask is samples.mask
@@ -135,14 +135,14 @@ def test_replay_weights_multiply_every_loss(make):
         assert (n == 0).all()
 
 
-def test_new_priorities_are_those_of_the_td_loss(make):
+def test_new_priorities_come_from_the_td_loss(make):
     model = trained_model(make, replay_buffer_kwargs={"alpha": 0.5})
     samples = model.replay_buffer.sample(8)
     with th.no_grad():
         td = loss_terms(model, samples)
     train_on(model, samples)
     found = model.replay_buffer._tree.get(samples.indices)
-    last = {int(i): b for b, i in enumerate(samples.indices)}  # of a leaf drawn twice, the last counts
+    last = {int(i): b for b, i in enumerate(samples.indices)}  # the last of several samples of a transition counts
     for index, b in last.items():
         expected = (td.priorities[b].item() + 1e-6) ** 0.5
         assert found[list(samples.indices).index(index)] == pytest.approx(expected, rel=1e-5)
@@ -159,7 +159,7 @@ def test_gradients_are_clipped_together(make):
 
 
 @pytest.mark.parametrize("network, encoder", [(PAPER, GroupFeaturesExtractor), ({}, NormalizedExtractor)])
-def test_one_features_pass_serves_both(make, monkeypatch, network, encoder):
+def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, encoder):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(44)
     calls = []
     forward = encoder.forward
@@ -167,14 +167,14 @@ def test_one_features_pass_serves_both(make, monkeypatch, network, encoder):
     monkeypatch.setattr(encoder, "forward", watched)
     model.train(1, 8)
     online, target = model.policy.online.features_extractor, model.policy.target.features_extractor
-    # s_t with gradient, then all that the target sees: s_{t+n} and M steps of rollout, in one pass where one network does.
+    # s_t with gradient, then the target's inputs: s_{t+n} and M steps of rollout, in one pass if one network computes both.
     following = [(target, 8 + 8 * 2)] if network else [(target, 8), (online, 8 * 2)]
     assert calls == [(online, 8), *following]
 
 
 @pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])
-def test_a_pass_on_a_cpu_takes_so_much_at_a_time(make, monkeypatch, policy, size):
-    """In pieces or whole: the same losses, to rounding."""
+def test_a_pass_on_a_cpu_is_split_into_pieces(make, monkeypatch, policy, size):
+    """Computing in pieces gives the same losses, to rounding."""
     env = ImageEnv() if policy == "CnnPolicy" else SimpleMultiObsEnv(channel_last=True)
     model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(44)
     samples, losses = model.replay_buffer.sample(8), []
@@ -197,10 +197,10 @@ def test_online_and_target_observations_are_augmented(make, monkeypatch):
 
 
 @pytest.mark.parametrize("off", [{"shift_pixels": 0}, {"intensity_scale": 0.0}, {}])
-def test_augmentation_switches(make, off):
+def test_augmentations_can_be_switched_off(make, off):
     model = make(ImageEnv(), "CnnPolicy", **off)
     images = th.randint(1, 256, (16, 1, 36, 36), dtype=th.uint8)
-    found = model.objective.augment(images) * 255  # what the networks see is in [0, 1]
+    found = model.objective.augment(images) * 255  # the networks' inputs are in [0, 1]
     moved = not all(th.equal((f > 0), (i > 0)) for f, i in zip(found, images, strict=True))
     assert not moved  # every pixel is above 0 before and after
     integral = th.allclose(found, found.round(), atol=1e-4, rtol=0)
@@ -212,8 +212,8 @@ def test_augmentation_switches(make, off):
         assert not th.allclose(found, images.float(), atol=0.5)
 
 
-def test_the_learning_rate_never_falls_below_zero(make):
-    """The last round goes beyond the total, where a line, such as RL Zoo's lin_1e-3, is negative."""
+def test_the_learning_rate_is_never_negative(make):
+    """The last round ends after total_timesteps, where a linear schedule such as RL Zoo's lin_1e-3 is negative."""
     seen = []
     model = make(ChainEnv(), learning_rate=lambda progress: seen.append(progress) or 1e-2 * progress, train_freq=64)
     model.learn(150)  # ends at 192

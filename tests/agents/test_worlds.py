@@ -1,4 +1,4 @@
-"""The pixel worlds: sliding ball, pendulum, star field."""
+"""The pixel environments: sliding ball, pendulum, star field."""
 
 import json
 import time
@@ -27,12 +27,12 @@ on_every_world = pytest.mark.parametrize("env_id", IDS)
 
 
 def assert_same_picture(picture, other):
-    """Up to the rounding of a pixel's last bit."""
+    """Up to the rounding of pixels."""
     np.testing.assert_allclose(picture.astype(int), other.astype(int), atol=1)
 
 
 @on_every_world
-def test_the_environment_is_one(env_id):
+def test_the_environment_passes_the_checker(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
@@ -48,7 +48,7 @@ def test_the_environment_is_one(env_id):
 
 
 @on_every_world
-def test_the_seed_decides(env_id):
+def test_the_seed_determines_the_episodes(env_id):
     def play(seed):
         env = gym.make(env_id)
         rng = np.random.default_rng(7)
@@ -82,7 +82,7 @@ def test_a_step_is_fast(env_id):
         start = time.perf_counter()
         env.step(step % N_ACTIONS[env_id])
         seconds.append(time.perf_counter() - start)
-    assert np.median(seconds) < 0.002  # a tenth of it on a core of its own
+    assert np.median(seconds) < 0.002  # about a tenth of it on an idle core
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_step_is_fast(env_id):
         (lambda: StarField(False).step(6), r"action: expected one of Discrete\(6\), found 6"),
     ],
 )
-def test_what_is_not_legal_is_refused(make, message):
+def test_invalid_arguments_raise(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -141,14 +141,14 @@ def test_the_ball_moves_one_step_per_action():
     assert (np.histogram(places, 4, (0, 1))[0] > 30).all()
 
 
-def test_up_is_up_and_left_is_left():
+def test_the_directions_of_the_torus_actions():
     env = SlidingBall(2, n_steps=8)
     for action, shift in enumerate([(-6, 0), (6, 0), (0, -6), (0, 6)]):  # 48 pixels in eight steps
         first, _ = env.reset(options={"position": [0.5, 0.25]})
         assert (env.step(action)[0] == np.roll(first, shift, axis=(0, 1))).all()
 
 
-def test_the_disc_is_whole_everywhere():
+def test_the_disc_is_complete_everywhere():
     env = SlidingBall(2)
     middle = env.draw([0.5, 0.5])[:, :, 0]
     assert middle[24, 24] == 255 and middle[24, 19] == 255 and middle[24, 16] == 0  # radius 6 about (24, 24)
@@ -172,22 +172,22 @@ def test_the_steps_of_the_torus_commute():
     assert all((observation == ends[0][0]).all() and (place == ends[0][1]).all() for observation, place in ends)
 
 
-def test_the_goal():
+def test_reaching_the_goal():
     env = SlidingBall(goal=[0.98], n_steps=10, render_mode="rgb_array")
     env.reset(options={"position": [0.15]})
-    assert env.step(0)[1:3] == (0.0, False)  # 0.05: by 0.07 away, around the edge
-    assert env.step(0)[1:3] == (1.0, True)  # 0.95
+    assert env.step(0)[1:3] == (0.0, False)  # at 0.05, which is 0.07 away across the edge
+    assert env.step(0)[1:3] == (1.0, True)  # at 0.95
     assert (env.render()[:, :, 1].astype(int) - env.render()[:, :, 0]).max() > 80
     env = SlidingBall(2, n_steps=4, goal=(0.5, 0.5))
     env.reset(options={"position": [0.25, 0.75]})
-    assert env.step(1)[1:3] == (0.0, False)  # right in one axis
+    assert env.step(1)[1:3] == (0.0, False)  # at the goal in one axis only
     assert env.step(2)[1:3] == (1.0, True)
     env = SlidingBall(n_steps=3, goal=[0.5])
     starts = np.array([env.reset(seed=seed)[1]["position"][0] for seed in range(100)])
     assert (abs(starts - 0.5) > 1 / 6).all()
 
 
-def test_the_pendulum_is_gymnasiums():
+def test_the_pendulum_matches_gymnasiums():
     env, other = PixelPendulum(n_torques=5), PendulumEnv()
     rng = np.random.default_rng(0)
     for seed in range(3):
@@ -202,10 +202,10 @@ def test_the_pendulum_is_gymnasiums():
             assert -pi <= info["angle"] <= pi and not (terminated or truncated)
 
 
-def test_the_free_pendulum():
+def test_the_pendulum_without_gravity():
     env = PixelPendulum(gravity=False, n_torques=5)
     env.reset(options={"angle": 0.3, "velocity": 2.0})
-    for _ in range(20):  # one second: energy ω²/6 stays, to the last bit
+    for _ in range(20):  # one second: the energy ω²/6 is constant, bit for bit
         _, reward, _, _, info = env.step(2)
         assert info["velocity"] == 2.0 and reward == 0
     np.testing.assert_allclose(info["angle"], 2.3)
@@ -216,20 +216,20 @@ def test_the_free_pendulum():
     assert info["velocity"] == 8  # clipped
 
 
-def test_a_swing_keeps_its_energy():
+def test_a_swinging_pendulum_keeps_its_energy():
     env = PixelPendulum()
     env.reset(options={"angle": pi / 2, "velocity": 0})
     info = env.step(1)[4]
     np.testing.assert_allclose([info["velocity"], info["angle"]], [0.75, pi / 2 + 0.0375])  # 15 · 0.05; 0.75 · 0.05
     states = np.array([list(env.step(1)[4].values()) for _ in range(2000)])
-    # Let go level: at the bottom mgl/2 = 5 = ω²/6. The method is of first order, so the energy swings, but does not drift.
+    # Released from horizontal, so ω²/6 = mgl/2 = 5 at the bottom. A first-order method: the energy oscillates, without drift.
     np.testing.assert_allclose(abs(states[:, 1]).max(), sqrt(30), rtol=0.02)
     energy = states[:, 1] ** 2 / 6 + 5 * np.cos(states[:, 0])
     assert abs(energy).max() < 1.1 and abs(energy[-500:].mean() - energy[:500].mean()) < 0.05
 
 
 @pytest.mark.parametrize("gravity", [True, False])
-def test_the_mirror(gravity):
+def test_the_mirrored_pendulum(gravity):
     env, mirror = PixelPendulum(gravity, n_torques=7), PixelPendulum(gravity, n_torques=7)
     first, info = env.reset(seed=2)
     other, _ = mirror.reset(options={key: -value for key, value in info.items()})
@@ -242,7 +242,7 @@ def test_the_mirror(gravity):
         assert (observation == other[:, ::-1]).all()
 
 
-def test_turning_the_free_pendulum_changes_no_torque():
+def test_rotating_the_pendulum_without_gravity_changes_no_torque():
     env, turned = PixelPendulum(gravity=False), PixelPendulum(gravity=False)
     _, info = env.reset(seed=4)
     turned.reset(options={"angle": info["angle"] + pi / 2, "velocity": info["velocity"]})
@@ -251,7 +251,7 @@ def test_turning_the_free_pendulum_changes_no_torque():
         assert_same_picture(np.rot90(observation), other)  # anticlockwise
 
 
-def test_the_velocity_is_seen():
+def test_the_velocity_is_observable():
     env = PixelPendulum()
     present, _ = env.reset(options={"angle": 3.0, "velocity": 5.0})
     for action in (2, 1, 0):
@@ -262,7 +262,7 @@ def test_the_velocity_is_seen():
     assert upright[6, 23:25].min() == 255 and upright[30:].max() == 0  # the rod ends at row 24 − 19
     left = env.draw(pi / 2, 0.0)[:, :, 1]
     assert left[23:25, 6].min() == 255 and left[:, 30:].max() == 0
-    # What an action changes can be seen one step later.
+    # The effect of an action is visible one step later.
     free = PixelPendulum(gravity=False)
     pictures = []
     for action in range(3):
@@ -271,7 +271,7 @@ def test_the_velocity_is_seen():
     assert min(abs(pictures[0] - pictures[1]).max(), abs(pictures[1] - pictures[2]).max()) > 60
 
 
-def test_there_and_back_among_stars():
+def test_opposite_actions_cancel_in_the_star_field():
     env = StarField()
     first, info = env.reset(seed=0)
     for action in range(12):
@@ -286,7 +286,7 @@ def test_there_and_back_among_stars():
         assert (reward, terminated, truncated) == (0.0, False, False)
 
 
-def test_a_full_turn_and_a_whole_cube():
+def test_a_full_turn_and_crossing_the_cube_return_to_the_start():
     env = StarField()
     for action in range(6):
         first, _ = env.reset(seed=action)
@@ -301,12 +301,12 @@ def test_a_full_turn_and_a_whole_cube():
         assert ((0 <= moved["translation"]) & (moved["translation"] < 1)).all()
 
 
-def test_a_star_moves_as_its_action_says():
-    """One star right ahead goes where the camera does not; places by hand."""
+def test_how_each_action_moves_a_star():
+    """A single star ahead moves opposite to the camera; its position is computed by hand."""
     env = StarField(n_stars=1)
     env.colours[:] = 1
     ahead, angle = 0.25, TURN
-    shift = 24 * np.tan(angle), 24 * MOVE / ahead  # pixels, with the focal length of 24 that 90° need
+    shift = 24 * np.tan(angle), 24 * MOVE / ahead  # pixels, for the focal length of 24 of a 90° view
     places = {0: (shift[0], 0), 1: (-shift[0], 0), 2: (0, -shift[0]), 3: (0, shift[0]), 4: (0, 0), 5: (0, 0)}
     places |= {FORWARD: (0, 0), BACK: (0, 0), RIGHT: (0, -shift[1]), LEFT: (0, shift[1])}
     places |= {UP: (shift[1], 0), DOWN: (-shift[1], 0)}
@@ -329,17 +329,17 @@ def test_a_star_moves_as_its_action_says():
     assert env.draw(env.rotation, env.translation).max() == 0  # behind the camera
 
 
-def test_rolling_turns_the_picture():
+def test_rolling_rotates_the_image():
     env = StarField(translations=False)
     for seed in range(3):
         first, _ = env.reset(seed=seed)
-        for _ in range(8):  # a quarter
+        for _ in range(8):  # a quarter turn
             observation = env.step(4)[0]
-        assert_same_picture(np.rot90(first), observation)  # the camera clockwise, so the picture anticlockwise
+        assert_same_picture(np.rot90(first), observation)  # the camera turns clockwise, so the image turns anticlockwise
 
 
 def picture_by_loops(env, rotation, translation):
-    """The same picture pixel by pixel and star by star, far to near."""
+    """The same image, computed for each pixel and star, from far to near."""
     inverse = np.linalg.inv(np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
     size = env.size
     copies = []
@@ -359,15 +359,15 @@ def picture_by_loops(env, rotation, translation):
     return picture
 
 
-def test_the_picture_by_loops():
-    env = StarField(size=36, n_stars=120)  # so many that some overlap
+def test_the_image_matches_loops():
+    env = StarField(size=36, n_stars=120)  # enough that some overlap
     for seed in range(2):
         observation, info = env.reset(seed=seed)
         expected = picture_by_loops(env, info["rotation"], info["translation"])
         np.testing.assert_allclose(observation, 255 * expected, atol=0.51)
 
 
-def test_rotations_stay_rotations():
+def test_rotations_stay_orthogonal():
     env = StarField()
     env.reset(seed=0)
     for action in np.random.default_rng(0).integers(0, 12, 100_000):
@@ -386,7 +386,7 @@ def test_poses_are_uniform():
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (4000, 3, 3)), atol=1e-12)
     np.testing.assert_allclose(rotations.mean(axis=0), np.zeros((3, 3)), atol=0.04)
     np.testing.assert_allclose((rotations**2).mean(axis=0), np.full((3, 3), 1 / 3), atol=0.02)
-    # Of uniform rotations the angle has the density (1 − cos)/π: mean π/2 + 2/π.
+    # The angle of uniform rotations has the density (1 − cos)/π and the mean π/2 + 2/π.
     angles = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
     np.testing.assert_allclose(angles.mean(), pi / 2 + 2 / pi, atol=0.05)
 
@@ -399,7 +399,7 @@ def test_layouts():
     _, info = still.reset(seed=3)
     assert (info["translation"] == 0.5).all() and json.dumps(still.metadata)
     mean = np.mean([env.reset(seed=seed)[0].max(axis=2) > 40 for seed in range(50)])
-    assert 0.03 < mean < 0.5  # enough to see, and something dark between
+    assert 0.03 < mean < 0.5  # neither empty nor full
 
 
 @pytest.mark.parametrize("env_id", [name for name in envs.WORLDS if name != "BlindCliffwalk-v0"])

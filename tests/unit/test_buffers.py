@@ -19,11 +19,11 @@ BOTH = pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, Prioritize
 
 
 class Stream:
-    """Random episodes in several environments, remembered whole: what the plainest buffer would hold."""
+    """Random episodes in several environments, recorded completely and simply, to compare buffers with."""
 
     def __init__(self, space, n_envs, seed=0, padding="zero", mean_length=6, channels=1):
         self.space, self.n_envs, self.padding, self.mean_length = space, n_envs, padding, mean_length
-        self.channels = channels  # of one frame
+        self.channels = channels  # per frame
         self.rng = np.random.default_rng(seed)
         self.steps = []  # one dict of arrays per call of add
         self.obs = np.stack([self.first() for _ in range(n_envs)])
@@ -62,7 +62,7 @@ class Stream:
             self.obs = np.stack([self.first() if d else o for d, o in zip(done, next_obs, strict=True)])
 
     def window(self, position, env, size, n, depth, gamma):
-        """The window that starts at a position of the ring, by loops in float64, or None if it crosses the head."""
+        """The window that starts at a position of the ring, with loops in float64; ``None`` if it crosses the write head."""
         start = max(k for k in range(position, len(self.steps), size))
         taken = []
         for k in range(start, start + max(n, depth)):
@@ -91,8 +91,8 @@ class Stream:
 
 @pytest.mark.parametrize("n_steps", [1, 3, 7])
 @pytest.mark.parametrize("n_envs, n_adds", [(1, 30), (1, 97), (3, 97)])
-def test_without_rollout_it_is_sb3s_n_step_buffer(n_steps, n_envs, n_adds):
-    """Field by field and draw by draw, before and after wrap-around, with time-outs."""
+def test_without_rollout_it_equals_sb3s_n_step_buffer(n_steps, n_envs, n_adds):
+    """Every field of every sample, before and after wrap-around, with time-outs."""
     stream = Stream(VECTOR, n_envs)
     theirs = NStepReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
     ours = SequenceReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
@@ -108,7 +108,7 @@ def test_without_rollout_it_is_sb3s_n_step_buffer(n_steps, n_envs, n_adds):
     assert th.equal(found.weights, th.ones(64)) and found.mask is None
 
 
-def test_one_step_without_rollout_is_sb3s_plain_buffer():
+def test_one_step_without_rollout_equals_sb3s_plain_buffer():
     stream = Stream(IMAGES, 2)
     theirs = ReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2)
     ours = SequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2, frame_stack=4)
@@ -130,15 +130,15 @@ STACKS = [
     (IMAGES, 2, "zero"),
 ]
 WINDOWS = [(3, 5), (6, 2), (1, 1)]
-RINGS = [(3, 101), (1, 25)]  # environments and steps: overwritten three times, and not full yet
-# Every kind of stack on the first window and ring; two kinds on all of them.
+RINGS = [(3, 101), (1, 25)]  # environments and steps: one buffer is overwritten three times, the other is not full yet
+# Every kind of stack with the first window and ring; two kinds with all windows and rings.
 CASES = [(*stack, *WINDOWS[0], *RINGS[0]) for stack in STACKS[2:]]
 CASES += [(*stack, *window, *ring) for stack in STACKS[:2] for window in WINDOWS for ring in RINGS]
 
 
 @BOTH
 @pytest.mark.parametrize("space, frame_stack, padding, n_steps, depth, n_envs, n_adds", CASES)
-def test_every_sample_is_what_was_put_in(buffer_class, space, frame_stack, padding, n_steps, depth, n_envs, n_adds):
+def test_every_sample_matches_what_was_added(buffer_class, space, frame_stack, padding, n_steps, depth, n_envs, n_adds):
     stream = Stream(space, n_envs, padding=padding, mean_length=5, channels=4 // frame_stack)
     buffer = buffer_class(
         30 * n_envs,
@@ -155,7 +155,7 @@ def test_every_sample_is_what_was_put_in(buffer_class, space, frame_stack, paddi
     np.random.seed(0)
     samples = buffer.sample(800)
     starts, first, which = np.unique(samples.indices, return_index=True, return_inverse=True)
-    for field, value in samples._asdict().items():  # a start that is drawn again gives the same window
+    for field, value in samples._asdict().items():  # a start that is sampled again gives the same window
         if field != "weights":
             assert np.array_equal(np.asarray(value), np.asarray(value)[first][which]), field
     for b, index in zip(first, starts, strict=True):
@@ -168,11 +168,11 @@ def test_every_sample_is_what_was_put_in(buffer_class, space, frame_stack, paddi
                 np.testing.assert_allclose(found, value, rtol=1e-5, atol=1e-6)
             else:
                 assert np.array_equal(found, np.asarray(value, dtype=found.dtype)), field
-    assert len(starts) == (min(n_adds, 30) - max(n_steps, depth) + 1) * n_envs  # every legal start, and no other
+    assert len(starts) == (min(n_adds, 30) - max(n_steps, depth) + 1) * n_envs  # every legal start and no others
 
 
 def test_axes_and_mask_by_hand():
-    """Observation 10·b + t of environment b at step t: what an axis read the wrong way round would mix up."""
+    """Environment b observes 10·b + t at step t, so swapped axes give other numbers."""
     space = spaces.Box(0, 255, (1,), np.float32)
     n_envs, depth, lengths = 4, 3, [2, 1, 5, 3]
     buffer = SequenceReplayBuffer(100, space, ACTIONS, "cpu", n_envs, n_steps=2, prediction_depth=depth, gamma=0.5)
@@ -194,7 +194,7 @@ def test_axes_and_mask_by_hand():
     assert samples.dones[rows, 0].tolist() == [1, 1, 0, 0]
 
 
-def test_nothing_is_drawn_before_the_first_window_is_whole():
+def test_nothing_is_sampled_before_the_first_window_is_complete():
     stream = Stream(VECTOR, 2, mean_length=1000)
     buffer = SequenceReplayBuffer(60, VECTOR, ACTIONS, "cpu", 2, n_steps=4, prediction_depth=2)
     stream.feed(3, buffer)
@@ -216,14 +216,14 @@ def test_n_and_gamma_are_read_at_sampling_time(buffer_class):
             assert expected is not None
             np.testing.assert_allclose(samples.rewards[b], expected["rewards"], rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(samples.discounts[b], expected["discounts"], rtol=1e-6)
-        stream.feed(3, buffer)  # between two samples, too
+        stream.feed(3, buffer)  # also between two samples
         samples = buffer.sample(4000)
-        # The ring's newest is at 19: the starts are the positions of age max(n, M) - 1 and above.
+        # The newest transition is at 19; windows start at the positions of age max(n, M) - 1 and above.
         assert len(set(samples.indices)) == 50 - max(n_steps, 2) + 1
 
 
 def test_a_reset_in_the_middle_of_an_episode_ends_its_windows():
-    """``learn`` called a second time resets the environment without telling the buffer."""
+    """A second call of ``learn`` resets the environment, and nothing notifies the buffer."""
     stream = Stream(VECTOR, 2, mean_length=10**9)
     buffer = SequenceReplayBuffer(60, VECTOR, ACTIONS, "cpu", 2, n_steps=3, prediction_depth=3)
     stream.feed(5, buffer)
@@ -260,9 +260,9 @@ def test_dict_and_discrete_observations():
             assert np.array_equal(samples.next_observations[key][b].numpy(), expected[1])
 
 
-def test_vec_normalize_acts_on_every_observation_and_on_one_step_rewards():
+def test_vec_normalize_is_applied_to_every_observation_and_to_one_step_rewards():
     class Halve(VecNormalize):
-        def __init__(self):  # only these two are used
+        def __init__(self):  # only the two methods below are used
             pass
 
         def normalize_obs(self, obs):
@@ -296,7 +296,7 @@ def test_memory_per_transition_at_atari_size():
     buffer = PrioritizedSequenceReplayBuffer(500, space, ACTIONS, "cpu", n_steps=10, prediction_depth=5, frame_stack=4)
     frames = np.random.default_rng(0).integers(0, 256, (50, 84, 84), dtype=np.uint8)
     stack = np.zeros((1, 4, 84, 84), dtype=np.uint8)
-    for t in range(1_100):  # wraps twice; an episode every 40 steps, far shorter than a life in Atari
+    for t in range(1_100):  # wraps around twice; episodes of 40 steps, far shorter than a life in Atari
         following = np.concatenate([stack[:, 1:], frames[None, None, t % 50]], axis=1)
         done = t % 40 == 39
         buffer.add(stack, following, np.zeros(1), np.zeros(1), np.array([done]), [{}])
@@ -307,8 +307,8 @@ def test_memory_per_transition_at_atari_size():
 
 
 @pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
-def test_too_large_for_the_machine_is_warned_of(buffer_class, monkeypatch):
-    """psutil is there where Ray is."""
+def test_a_buffer_too_large_for_the_machine_warns(buffer_class, monkeypatch):
+    """psutil is only installed where Ray is."""
     memory = SimpleNamespace(virtual_memory=lambda: SimpleNamespace(available=1_000))
     monkeypatch.setattr(buffers, "psutil", memory)
     with pytest.warns(UserWarning, match="not have apparently enough memory"):
@@ -325,7 +325,7 @@ def test_memory_does_not_grow_once_the_ring_is_full():
 
 
 @pytest.mark.parametrize("n_adds", [7, 95])
-def test_a_reset_buffer_is_a_new_one(n_adds):
+def test_a_reset_buffer_equals_a_new_one(n_adds):
     settings = (40, IMAGES, ACTIONS, "cpu", 2)
     kwargs = {"n_steps": 2, "prediction_depth": 3, "frame_stack": 4}
     used, new = (PrioritizedSequenceReplayBuffer(*settings, **kwargs) for _ in range(2))
@@ -341,7 +341,7 @@ def test_a_reset_buffer_is_a_new_one(n_adds):
 
 
 @pytest.mark.parametrize("n_adds", [7, 95])
-def test_saved_and_loaded_it_goes_on_the_same(n_adds):
+def test_a_loaded_buffer_continues_like_the_saved_one(n_adds):
     stream = Stream(IMAGES, 2, mean_length=3)
     buffer = PrioritizedSequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", 2, n_steps=2, prediction_depth=3, frame_stack=4)
     stream.feed(n_adds, buffer)
@@ -359,7 +359,7 @@ def test_saved_and_loaded_it_goes_on_the_same(n_adds):
                 assert th.equal(getattr(a, field), getattr(b, field)), field
 
 
-def test_a_buffer_filled_to_a_tenth_makes_a_small_file():
+def test_a_partly_filled_buffer_makes_a_small_file():
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
     buffer = SequenceReplayBuffer(2_000, space, ACTIONS, "cpu", frame_stack=4)
     stack = np.zeros((1, 4, 84, 84), dtype=np.uint8)
@@ -402,7 +402,7 @@ class TestPriorities:
         assert th.equal(samples.weights, th.ones(3600))
         assert np.bincount(samples.indices)[starts].min() >= 98
 
-    def test_new_transitions_enter_at_the_largest_priority(self):
+    def test_new_transitions_get_the_largest_priority(self):
         stream, buffer = self.make()
         starts = np.unique(buffer.sample(1000).indices)
         buffer.update_priorities(starts, th.full((36,), 1e-4))
@@ -411,11 +411,11 @@ class TestPriorities:
         stream.feed(1, buffer)
         new = set(buffer.sample(2000).indices) - set(starts)
         samples = buffer.sample(10_000)
-        assert len(new) == 2  # the starts whose window has just become whole
+        assert len(new) == 2  # the starts whose windows are now complete
         share = np.isin(samples.indices, list(new)).mean()
         assert share == pytest.approx(6 / (6 + 34 * (1e-4 + 1e-6) ** 0.5), abs=0.01)
 
-    def test_priorities_that_are_not_finite_are_passed_over(self):
+    def test_priorities_that_are_not_finite_are_ignored(self):
         _, buffer = self.make()
         starts = np.unique(buffer.sample(1000).indices)
         buffer.update_priorities(starts[:3], th.tensor([float("nan"), float("inf"), 0.0]))
@@ -423,11 +423,11 @@ class TestPriorities:
         assert th.isfinite(samples.weights).all()
         assert (samples.indices == starts[0]).any()
 
-    def test_what_is_overwritten_loses_its_priority(self):
+    def test_overwritten_transitions_lose_their_priority(self):
         stream, buffer = self.make()
         starts = np.unique(buffer.sample(1000).indices)
         buffer.update_priorities(starts, th.full((36,), 1e6))
-        stream.feed(20, buffer)  # everything anew
+        stream.feed(20, buffer)  # overwrites everything
         samples = buffer.sample(2000)
         for index in np.unique(samples.indices):
             position, env = divmod(int(index), 2)
@@ -447,13 +447,13 @@ class TestPriorities:
         ({"beta": 2.0}, "beta"),
     ],
 )
-def test_arguments_out_of_range_are_refused(kwargs, message):
+def test_arguments_out_of_range_raise(kwargs, message):
     arguments = {"buffer_size": 100, "n_steps": 3, "prediction_depth": 5, **kwargs}
     with pytest.raises(ValueError, match=message):
         PrioritizedSequenceReplayBuffer(observation_space=IMAGES, action_space=ACTIONS, device="cpu", **arguments)
 
 
-def test_a_frame_stack_that_is_not_one_is_refused_at_the_first_step():
+def test_observations_that_are_not_a_frame_stack_raise_at_the_first_step():
     buffer = SequenceReplayBuffer(40, IMAGES, ACTIONS, "cpu", frame_stack=4)
     obs = np.random.default_rng(0).integers(0, 256, (2, 1, 4, 6, 5), dtype=np.uint8)
     with pytest.raises(ValueError, match='"frame_stack": 1'):

@@ -1,4 +1,4 @@
-"""The state of an environment, taken from one and put into another that was built alike: both then do the same."""
+"""The state of an environment, captured and restored into another one built in the same way: both then behave the same."""
 
 import json
 
@@ -43,13 +43,13 @@ def play(env, actions):
     seen = []
     for action in actions:
         observations, rewards, dones, infos = env.step(action)
-        infos = [{key: value for key, value in info.items() if key != "episode"} for info in infos]  # wall-clock time in it
+        infos = [{key: value for key, value in info.items() if key != "episode"} for info in infos]  # has wall-clock times
         seen.append((observations.copy(), rewards.copy(), dones.copy(), [sorted(info) for info in infos]))
     return seen
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_both_do_the_same_from_then_on(name):
+def test_original_and_restored_environment_behave_the_same(name):
     first, second = WORLDS[name](0), WORLDS[name](7)
     rng = np.random.default_rng(0)
     actions = rng.integers(first.action_space.n, size=(90, first.num_envs))
@@ -66,7 +66,7 @@ def test_both_do_the_same_from_then_on(name):
         assert np.array_equal(a, e) and np.array_equal(b, f) and np.array_equal(c, g) and d == h
 
 
-def test_what_cannot_be_seen_is_named():
+def test_state_that_cannot_be_captured_is_named():
     pytest.importorskip("Box2D")
     env = make_vec_env("LunarLander-v3", 1)
     env.reset()
@@ -74,7 +74,7 @@ def test_what_cannot_be_seen_is_named():
     assert any("world" in path for path in hidden)
 
 
-def test_another_environment_is_refused():
+def test_a_different_environment_raises():
     first, second = (
         make_vec_env("CartPole-v1", 1),
         make_vec_env("CartPole-v1", 1, wrapper_class=gym.wrappers.FlattenObservation),

@@ -1,4 +1,4 @@
-"""Files and folders are complete or absent, whoever writes."""
+"""Files and folders are complete or absent, even with several writers."""
 
 import io
 import multiprocessing
@@ -52,7 +52,7 @@ def test_every_flipped_bit_of_a_sealed_zip_file_is_found(tmp_path):
 
 
 def hang(path):
-    """Write half a file, and half a folder, and never end."""
+    """Write half a file and half a folder, then wait to be killed."""
     with atomic_write(path, "bin") as file, atomic_folder(path.with_name("folder")) as folder:
         file.write(b"half")
         file.flush()
@@ -60,7 +60,7 @@ def hang(path):
         time.sleep(60)
 
 
-def test_leftovers_of_killed_processes_are_removed_and_living_ones_are_not(tmp_path):
+def test_partial_files_are_removed_unless_their_writer_is_running(tmp_path):
     path = tmp_path / "file.bin"
     context = multiprocessing.get_context("spawn")
     dead, alive = (context.Process(target=hang, args=(path,)) for _ in range(2))
@@ -74,10 +74,10 @@ def test_leftovers_of_killed_processes_are_removed_and_living_ones_are_not(tmp_p
     try:
         while len(set(names(tmp_path)) - set(left)) < 2 or not list(tmp_path.glob(".folder*/half")):
             time.sleep(0.01)
-        assert set(names(tmp_path)).isdisjoint(left)  # the new writer has removed them
+        assert set(names(tmp_path)).isdisjoint(left)  # the new writer has removed the leftovers
         with atomic_write(path, "bin") as file, atomic_folder(tmp_path / "folder"):
             file.write(b"whole")
-        assert len(names(tmp_path)) == 4 and path.read_bytes() == b"whole"  # beside those of the living
+        assert len(names(tmp_path)) == 4 and path.read_bytes() == b"whole"  # the others belong to the process still alive
     finally:
         alive.kill()
         alive.join()
@@ -86,7 +86,7 @@ def test_leftovers_of_killed_processes_are_removed_and_living_ones_are_not(tmp_p
     assert names(tmp_path) == ["file.bin", "folder"]
 
 
-def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
+def test_threads_can_write_the_same_file(tmp_path):
     path, errors = tmp_path / "file.bin", []
 
     def write(number):
@@ -107,7 +107,7 @@ def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
     assert not errors and names(tmp_path) == ["file.bin"]
 
 
-def test_a_folder_appears_with_everything_and_stays_the_first_one(tmp_path):
+def test_a_folder_appears_complete_and_is_not_replaced(tmp_path):
     path = tmp_path / "checkpoint"
     with atomic_folder(path) as folder:
         (folder / "deep").mkdir()

@@ -1,4 +1,4 @@
-"""Gradients by hand against autograd's, in float64, and what applies them against PyTorch's own functions."""
+"""Hand-written gradients compared with autograd in float64; assigning and clipping compared with PyTorch's functions."""
 
 from copy import deepcopy
 
@@ -25,7 +25,7 @@ def same(found, expected):
 
 
 @pytest.mark.parametrize("name", GROUPS, ids=str)
-def test_vector_jacobian_products_are_those_of_element_and_compose(name):
+def test_vector_jacobian_products_match_element_and_compose(name):
     group = make_group(name)
     th.manual_seed(0)
     params = th.randn(5, 3, group.num_params, dtype=th.float64, requires_grad=True)
@@ -43,8 +43,8 @@ def test_vector_jacobian_products_are_those_of_element_and_compose(name):
 
 @pytest.mark.parametrize("training", [True, False], ids=["train", "eval"])
 @pytest.mark.parametrize("name", GROUPS, ids=str)
-def test_rollout_is_one_step_after_the_other(name, training):
-    """The plain modules on states and one-hot actions, and the group's own operations, under autograd."""
+def test_rollout_equals_single_steps(name, training):
+    """Compared with the plain modules on states and one-hot actions and the group's operations, under autograd."""
     group = make_group(name).for_actions
     th.manual_seed(0)
     n_blocks, n_actions, n_steps = 3, 4, 3
@@ -67,11 +67,11 @@ def test_rollout_is_one_step_after_the_other(name, training):
         th.autograd.grad((x * weights).sum(), [state, *k.parameters()]) for x, k in ((found, kappa), (expected, plain))
     ]
     same(*gradients)
-    same(list(kappa.state_dict().values())[:5], list(plain.state_dict().values())[:5])  # the statistics moved alike
+    same(list(kappa.state_dict().values())[:5], list(plain.state_dict().values())[:5])  # the same batch statistics
 
 
 @pytest.mark.parametrize("training", [True, False], ids=["train", "eval"])
-def test_hidden_layer_is_its_modules(training):
+def test_hidden_layer_equals_its_modules(training):
     th.manual_seed(0)
     layer = HiddenLayer(5, 7, 3).double().train(training)
     plain = nn.Sequential(*deepcopy(layer))
@@ -83,7 +83,7 @@ def test_hidden_layer_is_its_modules(training):
     same([layer[1].running_mean, layer[1].running_var], [plain[1].running_mean, plain[1].running_var])
 
 
-def test_noisy_layer_is_its_formula():
+def test_noisy_layer_follows_its_formula():
     th.manual_seed(0)
     layer = NoisyLinear(5, 3).double()
     ((noise_out, noise_in),) = draw_noise([layer])
@@ -109,13 +109,13 @@ def test_distance_of_directions(target_is_trained):
     same(*[th.autograd.grad((x * weights).sum(), inputs) for x in (found, expected)])
 
 
-def test_gradients_are_assigned_as_backward_leaves_them():
+def test_assigned_gradients_equal_those_of_backward():
     th.manual_seed(0)
     network, frozen, unused = nn.Linear(3, 2), nn.Linear(2, 1).requires_grad_(False), nn.Linear(2, 2)
     parameters = [*network.parameters(), *frozen.parameters(), *unused.parameters()]
     inputs = th.randn(4, 3)
     for parameter in parameters:
-        parameter.grad = th.ones_like(parameter)  # of an update before
+        parameter.grad = th.ones_like(parameter)  # from an earlier update
     assign_gradients(frozen(network(inputs)).square().sum(), parameters)
     found = [parameter.grad for parameter in parameters]
     for parameter in parameters:
@@ -126,7 +126,7 @@ def test_gradients_are_assigned_as_backward_leaves_them():
 
 
 @pytest.mark.parametrize("max_norm", [None, 0.1, 100.0])
-def test_clipping_is_that_of_pytorch(max_norm):
+def test_clipping_equals_pytorchs(max_norm):
     th.manual_seed(0)
     parameters = [nn.Parameter(th.zeros(3, 2)), nn.Parameter(th.zeros(4)), nn.Parameter(th.zeros(1))]
     for parameter in parameters[:2]:
@@ -142,8 +142,8 @@ def test_clipping_is_that_of_pytorch(max_norm):
 
 
 @pytest.mark.parametrize("share", [None, 0.0, 0.3, 1e6])
-def test_two_gradients_meet_at_the_state(share):
-    """The encoder sees TD's gradient and as much of the auxiliary one as its share allows; by autograd, term by term."""
+def test_branch_limits_the_auxiliary_gradient(share):
+    """The encoder gets the TD gradient and the auxiliary one up to its share; computed term by term with autograd."""
     th.manual_seed(0)
     inputs = th.randn(5, 4, dtype=th.float64)
     encoder, gram = nn.Linear(4, 6).double(), th.zeros(2, 2, dtype=th.float64)
@@ -166,7 +166,7 @@ def test_two_gradients_meet_at_the_state(share):
     th.testing.assert_close(gram, th.einsum("ik,jk->ij", flat, flat))
 
 
-def test_no_gradient_is_no_division_by_zero():
+def test_a_zero_gradient_does_not_divide_by_zero():
     features = th.randn(3, 2, requires_grad=True)
     branched, state = branch(features, 0.5, th.zeros(2, 2))
     (found,) = th.autograd.grad(branched.sum() + 0 * state.sum(), features)

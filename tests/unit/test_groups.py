@@ -28,7 +28,7 @@ IDS = [f"{name}-{parameterization}" for name, parameterization in GROUPS]
 def random_elements(group, *batch, seed=0):
     generator = th.Generator().manual_seed(seed)
     params = th.randn(*batch, group.num_params, generator=generator, dtype=th.float64)
-    if "GL" in group.name:  # well conditioned: shift each matrix of the GL blocks towards the identity
+    if "GL" in group.name:  # shift each matrix of the GL blocks towards the identity, so that it is well conditioned
         params = params + 4 * group_identity_params(group)
     return group.element(params)
 
@@ -82,7 +82,7 @@ def random_params(group, seed):
 @pytest.mark.parametrize("n", [2, 3, 6])
 @pytest.mark.parametrize("kind", ["SO", "SE"])
 @pytest.mark.parametrize("parameterization", ["euler", "exp", "gram-schmidt"])
-def test_rotations_are_rotations(n, kind, parameterization):
+def test_rotations_are_orthogonal_with_determinant_1(n, kind, parameterization):
     rotation = random_elements(make_group(f"{kind}({n})", parameterization), 7)[..., :n, :n]
     eye = th.eye(n, dtype=th.float64).expand(7, n, n)
     th.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-12)
@@ -93,13 +93,13 @@ def test_gram_schmidt_against_the_qr_decomposition():
     for n in (2, 3, 5):
         columns = np.random.default_rng(n).normal(size=(n, n))
         q, r = np.linalg.qr(columns)
-        q = q * np.sign(np.diag(r))  # the decomposition with a positive diagonal is the one of Gram and Schmidt
-        q[:, -1] *= np.linalg.det(q)  # of the two that complete it, the rotation
+        q = q * np.sign(np.diag(r))  # with a positive diagonal, the decomposition is Gram-Schmidt's
+        q[:, -1] *= np.linalg.det(q)  # of the two possible last columns, the one of a rotation
         params = th.as_tensor(columns[:, :-1].T.reshape(1, -1).copy())
         np.testing.assert_allclose(make_group(f"SO({n})", "gram-schmidt").element(params)[0].numpy(), q, atol=1e-12)
 
 
-def test_gram_schmidt_has_no_seam_and_a_direction_at_zero():
+def test_gram_schmidt_is_continuous_and_defined_at_zero():
     group = make_group("SO(2)", "gram-schmidt")
     by_hand = th.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=th.float64)
     th.testing.assert_close(group.element(th.tensor([3.0, 4.0], dtype=th.float64)), by_hand)
@@ -109,17 +109,17 @@ def test_gram_schmidt_has_no_seam_and_a_direction_at_zero():
             found = zero.element(th.zeros(1, zero.num_params, dtype=dtype))
             assert th.equal(found, zero.identity(1, dtype=dtype))
     loop = th.linspace(0, 2 * np.pi, 361, dtype=th.float64)
-    elements = group.element(th.stack([loop.cos(), loop.sin()], dim=1))  # numbers that close, as a network's on a loop do
-    assert (elements[1:] - elements[:-1]).abs().max() < 0.02  # never a jump
+    elements = group.element(th.stack([loop.cos(), loop.sin()], dim=1))  # a closed curve, like a network's outputs on a loop
+    assert (elements[1:] - elements[:-1]).abs().max() < 0.02  # no jump
     steps = th.atan2(elements[1:, 1, 0], elements[1:, 0, 0]) - th.atan2(elements[:-1, 1, 0], elements[:-1, 0, 0])
-    assert abs(th.remainder(steps + np.pi, 2 * np.pi).sub(np.pi).sum().item() - 2 * np.pi) < 1e-9  # and once around
+    assert abs(th.remainder(steps + np.pi, 2 * np.pi).sub(np.pi).sum().item() - 2 * np.pi) < 1e-9  # and one full turn
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
-def test_gram_schmidt_where_columns_are_axes_or_depend_on_each_other(n):
+def test_gram_schmidt_of_axes_and_of_linearly_dependent_columns(n):
     group = make_group(f"SO({n})", "gram-schmidt")
     axes = th.eye(n, dtype=th.float64)[: n - 1].reshape(1, -1) * th.tensor([2.0], dtype=th.float64)
-    twice = th.tensor([[0.3, -0.2, 0.7, 1.0][:n] * (n - 1)], dtype=th.float64)  # every column the same
+    twice = th.tensor([[0.3, -0.2, 0.7, 1.0][:n] * (n - 1)], dtype=th.float64)  # all columns are equal
     for params in (axes, axes.flip(1), twice):
         for dtype, close in ((th.float64, 1e-12), (th.float32, 1e-5)):
             given = params.detach().to(dtype, copy=True).requires_grad_()
@@ -145,7 +145,7 @@ def test_euler_and_exp_agree_on_so2():
     th.testing.assert_close(euler_rotation(angles, 2), exp_rotation(angles, 2), rtol=0, atol=1e-12)
 
 
-def test_euler_is_the_product_over_planes_worked_out_by_hand():
+def test_euler_is_the_product_over_planes_by_hand():
     a, b, c = 0.3, -1.1, 2.0  # planes (0, 1), (0, 2), (1, 2)
     r01 = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
     r02 = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -164,8 +164,8 @@ def test_se2_element_and_inverse_by_hand():
 
 
 @pytest.mark.parametrize("name", ["SE(2)", "SE(3)", "GL(2)", "SO(3)", "affine"])
-def test_operations_are_those_of_the_matrices(name):
-    """What an element leaves out of its matrix is constant: the matrix product and inverse give the same."""
+def test_operations_match_those_of_the_matrices(name):
+    """Elements leave out only constant rows of their matrix, so their operations match the matrix product and inverse."""
     affine = [[[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 1, 0], [0, 0, 0]]]
     group = MatrixLieGroup(affine) if name == "affine" else make_group(name)
     params = th.randn(2, 5, group.num_params, generator=th.Generator().manual_seed(0), dtype=th.float64)
@@ -190,14 +190,14 @@ def test_parameter_counts_of_table_1(n):
 
 def test_element_shapes():
     assert make_group("GL(3)").element_shape == (3, 3)
-    assert make_group("SE(3)").element_shape == (3, 4)  # of a 4×4 matrix, the last row of which never moves
+    assert make_group("SE(3)").element_shape == (3, 4)  # the last row of the 4×4 matrix is constant
     assert make_group("T(3)").element_shape == (3,)
     product = make_group("SE(2)^8 x SO(3)^4")
     assert product.num_params == 8 * 3 + 4 * 3
     assert product.element_shape == (8 * 6 + 4 * 9,)
 
 
-def test_product_is_its_factors_side_by_side():
+def test_a_product_concatenates_its_factors():
     product, se2, so3 = make_group("SE(2)^2 x SO(3)"), make_group("SE(2)"), make_group("SO(3)")
     p, q = th.randn(2, 5, 9, generator=th.Generator().manual_seed(0), dtype=th.float64)
 
@@ -218,7 +218,7 @@ def test_generators_of_so2_give_so2():
     th.testing.assert_close(group.element(angles), make_group("SO(2)").element(angles), rtol=0, atol=1e-12)
 
 
-def test_no_group_lets_the_transition_predict_the_next_state():
+def test_without_a_group_the_transition_predicts_the_next_state():
     group = make_group("none(4)")
     left, right = th.randn(2, 3, 4)
     assert th.equal(group.compose(left, right), left)
@@ -227,7 +227,7 @@ def test_no_group_lets_the_transition_predict_the_next_state():
 
 
 @pytest.mark.parametrize("matrix", [th.zeros(2, 2), th.ones(3, 3), th.full((2, 2), 1e-30), th.diag(th.tensor([1.0, 1e-12]))])
-def test_singular_matrices_neither_stop_nor_poison(matrix):
+def test_the_guarded_inverse_of_a_singular_matrix_is_finite(matrix):
     good = th.eye(len(matrix)) * 2
     batch = th.stack([matrix, good]).requires_grad_()
     inverse = guarded_inverse(batch)
@@ -238,7 +238,7 @@ def test_singular_matrices_neither_stop_nor_poison(matrix):
     assert inverse.abs().max() < 1e6
 
 
-def test_damped_inverse_is_nearly_the_pseudo_inverse():
+def test_the_guarded_inverse_approximates_the_pseudo_inverse():
     matrix = th.diag(th.tensor([2.0, 0.0], dtype=th.float64))
     th.testing.assert_close(guarded_inverse(matrix), th.linalg.pinv(matrix), rtol=0, atol=1e-7)
 
@@ -246,7 +246,7 @@ def test_damped_inverse_is_nearly_the_pseudo_inverse():
 @pytest.mark.parametrize(
     "name", ["SU(2)", "SE", "SE(0)", "SO(1)", "T(-1)", "GL(2.5)", "SE(2)^0", "SE(2) x ", "", "gl(2)", "SE(2)^8 + SO(3)"]
 )
-def test_bad_names_are_refused_with_the_legal_ones(name):
+def test_bad_names_raise_with_the_valid_ones(name):
     with pytest.raises(ValueError, match=r"GL\(n\), SE\(n\), T\(n\)") as error:
         make_group(name)
     assert repr(name) in str(error.value)
@@ -262,6 +262,6 @@ def test_bad_parameterization_and_generators():
         MatrixLieGroup([[[1.0]], [[2.0]]])
 
 
-def test_a_group_passes_through():
+def test_make_group_returns_a_group_unchanged():
     group = T(3)
     assert make_group(group) is group

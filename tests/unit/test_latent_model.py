@@ -15,7 +15,7 @@ def identity(states):
 
 
 class KnownActions(GroupLatentModel):
-    """SO(2), one block, with the κ of a world where action 0 turns by +θ and action 1 by −θ, whatever the state."""
+    """SO(2), one block. In every state κ turns by +θ for action 0 and by −θ for action 1."""
 
     def __init__(self, theta):
         super().__init__(make_group("SO(2)"), 1, 2, state_dependent_actions=False)
@@ -41,7 +41,7 @@ def rotation(angles):
 
 
 def rotation_world(theta, rho_angle=0.0, mask=None):
-    """Losses on three starts and a few actions; the true world turns by ±0.7 radians."""
+    """Losses for three starts and a few actions, where the true rotation is ±0.7 radians."""
     model, target = KnownActions(theta), KnownActions(0.7)
     model.action_symmetry, model.projection, target.projection = Constant(rho_angle), nn.Identity(), nn.Identity()
     model.reward_net = Constant(0.25)
@@ -61,8 +61,8 @@ def test_the_true_kappa_has_no_transition_loss():
     assert losses.symmetry.abs().max() < 1e-14
 
 
-def test_wrong_kappas_cost_what_geometry_says():
-    """Two unit-normed rotation matrices that differ by the angle δ lie 2 − 2 cos δ apart."""
+def test_losses_of_wrong_kappas_by_hand():
+    """The loss of two normalised rotation matrices that differ by the angle δ is 2 − 2 cos δ."""
     losses, turns = rotation_world(0.0)  # never moves
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(turns)).mean(axis=1), atol=1e-12)
     np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.7)] * 3, atol=1e-12)
@@ -70,7 +70,7 @@ def test_wrong_kappas_cost_what_geometry_says():
     np.testing.assert_allclose(losses.aet, (2 - 2 * np.cos(2 * turns)).mean(axis=1), atol=1e-12)
 
 
-def test_a_wrong_rho_costs_get_alone():
+def test_a_wrong_rho_affects_get_only():
     losses, _ = rotation_world(0.7, rho_angle=0.4)
     assert losses.aet.abs().max() < 1e-14
     np.testing.assert_allclose(losses.symmetry, [2 - 2 * math.cos(0.4)] * 3, atol=1e-12)
@@ -82,7 +82,7 @@ def test_reward_loss_by_hand():
     np.testing.assert_allclose(losses.reward, expected, atol=1e-12)
 
 
-def test_every_loss_obeys_the_mask():
+def test_every_loss_uses_the_mask():
     mask = th.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 1.0, 0.0]], dtype=th.float64)
     losses, turns = rotation_world(0.0, mask=mask)
     costs = 2 - 2 * np.cos(turns)
@@ -114,7 +114,7 @@ def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", batch=6, depth=4, 
 
 
 def test_against_loops_over_samples_and_blocks():
-    """The whole of Eq. 18 and 19, one sample and one 3×3 matrix at a time; SE(2) does not commute, so order matters."""
+    """All of Eq. 18 and 19, one sample and one 3×3 matrix at a time; SE(2) is not commutative, so the order matters."""
     model, case = random_case()
     model.eval()
     state = th.get_rng_state()
@@ -137,7 +137,7 @@ def test_against_loops_over_samples_and_blocks():
         return [np.vstack([top, [0, 0, 1]]) for top in flat.reshape(3, 2, 3)]
 
     def entries(matrices):
-        return np.stack(matrices)[:, :2].ravel()  # the last row never moves
+        return np.stack(matrices)[:, :2].ravel()  # the last row is constant
 
     def distance(a, b):
         return np.sum((a / np.linalg.norm(a) - b / np.linalg.norm(b)) ** 2)
@@ -168,8 +168,8 @@ def test_against_loops_over_samples_and_blocks():
 
 
 @pytest.mark.parametrize("reward_loss", ["mse", "categorical"])
-def test_what_lies_behind_the_mask_has_no_influence(reward_loss):
-    """Not on the other samples either, although batch norm looks at the whole batch."""
+def test_masked_steps_have_no_influence(reward_loss):
+    """Nor on the other samples, although batch norm sees all of them."""
     model, case = random_case(reward_loss=reward_loss)
     model.train()
     case["mask"] = th.tensor([[1, 1, 1, 1]] * 4 + [[1, 0, 0, 0], [1, 1, 1, 0]], dtype=th.float64)
@@ -192,7 +192,7 @@ def test_what_lies_behind_the_mask_has_no_influence(reward_loss):
     assert all(th.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
-def test_gradients_go_where_the_design_says():
+def test_each_loss_trains_its_networks_only():
     model, case = random_case()
     state = case["state"].requires_grad_()
     th.manual_seed(0)
@@ -209,10 +209,10 @@ def test_gradients_go_where_the_design_says():
     assert all(p.grad is None for p in case["target"].parameters())
 
 
-def test_the_group_action_between_states_carries_no_gradient():
+def test_the_group_element_between_states_has_no_gradient():
     """
-    On SO(2) with a κ that ignores the state, τ_g · κ · x₀ does not depend on the angle a of x₀: were τ_g to carry a
-    gradient, d GET / da would be 0. Held fixed, GET = 2 − 2 cos(δ + a − a₀) with δ = −ρ, so d GET / da = −2 sin ρ.
+    On SO(2) with a κ that ignores the state, τ_g · κ · x₀ does not depend on the angle a of x₀, so if τ_g had a gradient,
+    d GET / da would be 0. With τ_g held constant, GET = 2 − 2 cos(δ + a − a₀) with δ = −ρ, so d GET / da = −2 sin ρ.
     """
     model = KnownActions(0.3)
     model.projection = nn.Identity()
@@ -241,7 +241,7 @@ def test_every_group_trains(group):
     assert th.isfinite(state.grad).all() and all(th.isfinite(p.grad).all() for p in model.parameters())
 
 
-def test_a_singular_state_neither_stops_nor_poisons():
+def test_losses_and_gradients_of_a_singular_state_are_finite():
     made = make_group("GL(2)")
     model = GroupLatentModel(made, 2, 3)
     state = th.zeros(4, 8, requires_grad=True)
@@ -251,7 +251,7 @@ def test_a_singular_state_neither_stops_nor_poisons():
     assert th.isfinite(state.grad).all() and all(th.isfinite(loss).all() for loss in losses)
 
 
-def test_what_is_absent_is_off():
+def test_losses_without_their_inputs_are_off():
     model, case = random_case()
     th.manual_seed(0)
     full = model.eval()(**case)
@@ -272,7 +272,7 @@ def test_without_a_group_the_network_predicts_the_next_state():
 
 
 def test_convolutional_transition_by_hand():
-    """One action, one channel, all kernels the identity: s, a become ReLU(s + a-plane), scaled to [0, 1]."""
+    """One channel and kernels with one nonzero weight: the next state is ReLU(s + the action's weight), scaled to [0, 1]."""
     model = ConvLatentModel((1, 2, 3), n_actions=2).double().eval()
     first, _, norm, second, _ = model.transition
     for layer in (first, second):
@@ -288,8 +288,8 @@ def test_convolutional_transition_by_hand():
     th.testing.assert_close(found[0, 1], once, atol=1e-5, rtol=0)  # s + 3, scaled to [0, 1] again
 
 
-def test_convolutional_transition_learns_to_turn_a_picture():
-    """A latent model that predicts: the state is the picture itself, actions shift it by a column."""
+def test_convolutional_transition_learns_to_shift_an_image():
+    """The latent state is the image itself, and actions shift it by a column."""
     th.manual_seed(0)
     model = ConvLatentModel((1, 4, 4), n_actions=2)
     optimizer = th.optim.Adam(model.transition.parameters(), lr=1e-2)

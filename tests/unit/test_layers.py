@@ -8,7 +8,7 @@ from sb3_eqr.common.networks.encoders import ConvTrunk, GroupLayer
 from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening, draw_noise
 
 
-def test_noise_is_factorised_and_fresh():
+def test_noise_is_factorised_and_redrawn():
     th.manual_seed(0)
     layer = NoisyLinear(6, 5, sigma_init=0.5)
     eye = th.eye(6)  # rows of weights: W e_k + b
@@ -20,7 +20,7 @@ def test_noise_is_factorised_and_fresh():
     for _ in range(3):
         (noise,) = draw_noise([layer])
         noisy = layer(eye, noise) - clean
-        bias_noise = layer(zero, noise) - layer(zero)  # what the bias alone gets
+        bias_noise = layer(zero, noise) - layer(zero)  # the noise of the bias alone
         weight_noise = (noisy - bias_noise).T / layer.weight_sigma  # f(ε_out) f(ε_in)ᵀ
         singular = th.linalg.svdvals(weight_noise)
         assert singular[1] < 1e-5 * singular[0]
@@ -36,8 +36,8 @@ def test_noise_does_not_depend_on_train_mode():
     assert th.equal(head(inputs), head(inputs))
 
 
-def test_a_draw_is_that_of_the_paper_for_every_layer():
-    """f(ε) = sign(ε) √|ε| of numbers drawn once, in the layers' order: outputs of the first, its inputs, and so on."""
+def test_noise_follows_the_paper_for_every_layer():
+    """f(ε) = sign(ε) √|ε|, drawn once for all layers: the outputs of the first, its inputs, the outputs of the second, ..."""
     layers = [NoisyLinear(6, 5), NoisyLinear(5, 2)]
     th.manual_seed(0)
     (out_1, in_1), (out_2, in_2) = draw_noise(layers)
@@ -47,7 +47,7 @@ def test_a_draw_is_that_of_the_paper_for_every_layer():
     assert [len(noise) for noise in (out_1, in_1, out_2, in_2)] == [5, 6, 2, 5]
 
 
-def test_noisy_initialisation_is_that_of_the_paper():
+def test_noisy_initialisation_follows_the_paper():
     layer = NoisyLinear(16, 1000, sigma_init=0.5)
     assert layer.weight.abs().max() <= 0.25 and layer.bias.abs().max() <= 0.25  # 1 / sqrt(16)
     assert layer.weight.std() > 0.13  # of U(-0.25, 0.25): 0.144
@@ -56,7 +56,7 @@ def test_noisy_initialisation_is_that_of_the_paper():
 
 @pytest.mark.parametrize("net_arch", [[], [8], [8, 6]], ids=str)
 def test_dueling_by_hand(net_arch):
-    """Two networks of their own, whose first layers lie side by side in one: first the advantage's, then the value's."""
+    """Two separate networks whose first layers are concatenated into one: the advantage's first, then the value's."""
     head = DistributionalHead(2, 3, 4, net_arch, nn.ReLU, dueling=True, sigma_init=None)
     features = th.randn(5, 2)
     hidden = [features, features]
@@ -78,7 +78,7 @@ def test_projection_is_the_first_layer_without_noise():
     assert head.project(features).shape == (5, 16)
 
 
-def test_conv_trunk_is_the_network_of_2015():
+def test_conv_trunk_is_the_network_of_mnih_et_al_2015():
     trunk = ConvTrunk(4)
     assert sum(p.numel() for p in trunk.parameters()) == 4 * 32 * 64 + 32 + 32 * 64 * 16 + 64 + 64 * 64 * 9 + 64
     images = th.rand(2, 4, 84, 84)
@@ -100,9 +100,9 @@ def test_shift_is_a_crop_of_the_edge_padded_image(channels, dtype):
     for before, after in zip(padded, shifted, strict=True):
         crops = {(y, x): before[:, y : y + 9, x : x + 7] for y in range(5) for x in range(5)}
         fitting = [offset for offset, crop in crops.items() if th.equal(crop, after)]
-        assert len(fitting) == 1  # all channels moved alike, by a whole number of pixels
+        assert len(fitting) == 1  # all channels are shifted alike, by an integer number of pixels
         offsets.update(fitting)
-    assert len(offsets) > 15  # of 25: images move each on its own
+    assert len(offsets) > 15  # of 25: each image has its own shift
     assert th.equal(random_shift(images, pad=0), images)
 
 
@@ -114,25 +114,25 @@ def test_intensity_scales_each_image_by_one_number():
     ratios = (scaled / images).flatten(1)
     th.testing.assert_close(ratios, ratios[:, :1].expand_as(ratios))
     noise = (ratios[:, 0] - 1) / 0.05
-    assert noise.abs().max() <= 2.0 + 1e-4 and 0.7 < noise.std() < 1.1  # a clipped normal has 0.88
+    assert noise.abs().max() <= 2.0 + 1e-4 and 0.7 < noise.std() < 1.1  # a clipped normal distribution has 0.88
     before = images.float()
     random_intensity(before, scale=0.5)
-    assert th.equal(before, images.float())  # the caller's images stay
+    assert th.equal(before, images.float())  # the caller's images are unchanged
 
 
 def correlated(n, dtype=th.float64):
-    """Features of very different sizes, far from 0."""
+    """Correlated features of very different scales, far from 0."""
     mixing = th.tensor([[1.0, 0.6, 0.0], [0.0, 0.8, 0.6], [0.0, 0.0, 0.8]], dtype=dtype) * th.tensor([1.0, 1e-3, 40.0])
     return th.randn(n, 3, dtype=dtype) @ mixing + 100.0
 
 
-def test_whitened_features_have_no_mean_no_correlation_and_variance_one():
+def test_whitened_features_have_mean_0_variance_1_and_no_correlation():
     th.manual_seed(0)
     whitening = Whitening(3).double()
     features = correlated(3000)
     white = whitening(features).detach().numpy()
     np.testing.assert_allclose(white.mean(axis=0), 0, atol=1e-10)
-    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(3), atol=0.02)  # 3 / 3003 of a correlation is not believed
+    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(3), atol=0.02)  # correlations are shrunk by 3 / 3003
     for _ in range(100):
         whitening(correlated(3000))
     whitening.eval()
@@ -141,13 +141,13 @@ def test_whitened_features_have_no_mean_no_correlation_and_variance_one():
     assert th.equal(before, whitening.running_mean)
 
 
-def test_whitening_one_feature_is_batch_norm():
+def test_whitening_one_feature_equals_batch_norm():
     features = th.randn(16, 1, dtype=th.float64) * 7 + 3
     expected = nn.BatchNorm1d(1, affine=False, eps=1e-12).double()(features)
     th.testing.assert_close(Whitening(1).double()(features), expected, rtol=1e-4, atol=0)
 
 
-def test_whitening_is_finite_where_features_are_alike_or_more_than_samples():
+def test_whitening_is_finite_for_equal_features_and_for_few_samples():
     whitening = Whitening(6)
     for features in (th.ones(4, 6), th.zeros(4, 6), th.randn(4, 1).expand(4, 6), th.randn(3, 6)):
         features = features.clone().requires_grad_()
@@ -156,7 +156,7 @@ def test_whitening_is_finite_where_features_are_alike_or_more_than_samples():
         assert white.isfinite().all() and features.grad.isfinite().all()
 
 
-def test_whitening_has_the_gradient_of_what_it_computes():
+def test_whitening_has_a_correct_gradient():
     th.manual_seed(1)
     assert th.autograd.gradcheck(Whitening(3).double(), th.randn(5, 3, dtype=th.float64, requires_grad=True))
 

@@ -32,10 +32,10 @@ def test_contrastive_loss_by_hand():
     th.testing.assert_close(found, th.full((2, 1), -math.log(own / (own + other))))
     th.testing.assert_close(contrastive_loss(target.flip(0), target, every), th.full((2, 1), -math.log(other / (own + other))))
     th.testing.assert_close(contrastive_loss(target, one.expand(2, 1, 2), every), th.full((2, 1), same))  # a collapse: log B
-    # negatives are those of the same step
+    # negatives come from the same step
     steps = th.cat([target, target.flip(0)], dim=1)  # (2, 2, 2)
     th.testing.assert_close(contrastive_loss(steps, steps, th.ones(2, 2)), th.full((2, 2), -math.log(own / (own + other))))
-    # what lies past the end of an episode is no negative; nothing that is said of it reaches the others
+    # steps after the end of an episode are not negatives, and their values do not affect the others
     mask = th.tensor([[1.0], [0.0]])
     masked = contrastive_loss(target, th.stack([one, 7 * one])[:, None], mask)
     th.testing.assert_close(masked[0], th.zeros(1))
@@ -62,7 +62,7 @@ def test_quantile_huber_loss_against_a_loop():
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6)  # midpoints are float32, as in sb3_contrib
 
 
-def test_quantile_huber_loss_has_contribs_mean_and_gradient():
+def test_quantile_huber_loss_has_the_mean_and_gradient_of_sb3_contribs():
     generator = th.Generator().manual_seed(0)
     values, target = th.randn(2, 32, 51, generator=generator) * 3
     ours, theirs = values.clone().requires_grad_(), values.clone().requires_grad_()
@@ -78,11 +78,11 @@ def test_quantile_huber_loss_has_contribs_mean_and_gradient():
     [
         ([-1.0, 0.0, 1.0], [0.2, 0.5, 0.3], [0.2, 0.5, 0.3]),  # the atoms themselves
         ([-0.5, 0.0, 0.25], [0.2, 0.4, 0.4], [0.1, 0.1 + 0.4 + 0.3, 0.1]),  # between atoms
-        ([0.4, 0.4, 0.4], [0.2, 0.4, 0.4], [0.0, 0.6, 0.4]),  # terminal: all atoms on the reward
-        ([5.0, 6.0, 7.0], [0.2, 0.4, 0.4], [0.0, 0.0, 1.0]),  # all beyond the top
+        ([0.4, 0.4, 0.4], [0.2, 0.4, 0.4], [0.0, 0.6, 0.4]),  # terminal: all atoms at the reward
+        ([5.0, 6.0, 7.0], [0.2, 0.4, 0.4], [0.0, 0.0, 1.0]),  # all above the range
         ([-3.0, -0.75, 9.0], [0.5, 0.2, 0.3], [0.5 + 0.15, 0.05, 0.3]),  # both ends clipped: no longer evenly spaced
-        ([0.5, -2.0, 0.0], [0.4, 0.1, 0.5], [0.1, 0.2 + 0.5, 0.2]),  # falling, then rising once clipped
-        ([2.0, 0.0, -1.5], [0.1, 0.2, 0.7], [0.7, 0.2, 0.1]),  # backwards
+        ([0.5, -2.0, 0.0], [0.4, 0.1, 0.5], [0.1, 0.2 + 0.5, 0.2]),  # decreasing, then increasing once clipped
+        ([2.0, 0.0, -1.5], [0.1, 0.2, 0.7], [0.7, 0.2, 0.1]),  # decreasing
     ],
 )
 def test_projection_by_hand(values, probabilities, expected):
@@ -92,7 +92,7 @@ def test_projection_by_hand(values, probabilities, expected):
 
 @pytest.mark.parametrize("n_atoms, v_min, v_max", [(51, -10.0, 10.0), (2, 0.0, 1.0), (11, -3.0, 17.0), (101, -0.1, 0.2)])
 def test_projection_against_a_loop_in_float64(n_atoms, v_min, v_max):
-    """For each atom and each value, the share of Bellemare et al. 2017, Eq. 7; terminal transitions among them."""
+    """Eq. 7 of Bellemare et al. 2017 for each atom and each value; some transitions are terminal."""
     rng = np.random.default_rng(0)
     batch, spacing = 8, (v_max - v_min) / (n_atoms - 1)
     support = v_min + spacing * np.arange(n_atoms)
@@ -118,7 +118,7 @@ def test_categorical_loss_by_hand():
     logits = th.tensor([[0.0, 0.0], [0.0, math.log(3)], [5.0, 5.0]], requires_grad=True)
     target = th.tensor([[0.5, 0.5], [0.5, 0.5], [1.0, 0.0]])
     loss, divergence = categorical_loss(logits, target)
-    # -1/2 ln 1/4 - 1/2 ln 3/4 = ln 4 - 1/2 ln 3; the target's own entropy is ln 2, ln 2, 0
+    # -1/2 ln 1/4 - 1/2 ln 3/4 = ln 4 - 1/2 ln 3; the entropy of the targets is ln 2, ln 2, 0
     expected = [math.log(2), math.log(4) - math.log(3) / 2, math.log(2)]
     th.testing.assert_close(loss, th.tensor(expected))
     th.testing.assert_close(divergence, th.tensor([0.0, math.log(2) - math.log(3) / 2, math.log(2)]), rtol=1e-5, atol=1e-7)

@@ -1,4 +1,4 @@
-"""Values come back from JSON as they were, and nothing is executed on the way."""
+"""Values survive a round trip through JSON, and loading executes no code."""
 
 import json
 import os
@@ -35,19 +35,19 @@ VALUES = [
 
 
 @pytest.mark.parametrize("value", VALUES, ids=str)
-def test_values_come_back_as_they_were(value):
+def test_round_trip_of_values(value):
     found = again(value)
     assert type(found) is type(value) and found == value
     assert "pickle" not in json.dumps(encode(value))
 
 
 @pytest.mark.parametrize("array", [np.arange(6.0).reshape(2, 3), np.zeros((0, 2), np.uint8), np.float32(2.5), np.bool_(True)])
-def test_arrays_come_back_with_shape_and_dtype(array):
+def test_round_trip_of_arrays_keeps_shape_and_dtype(array):
     found = again(array)
     assert type(found) is type(array) and found.dtype == array.dtype and np.array_equal(found, array)
 
 
-def test_tensors_schedules_generators_and_groups():
+def test_round_trip_of_tensors_schedules_generators_and_groups():
     tensor = th.get_rng_state()
     assert th.equal(again(tensor), tensor) and again(tensor).dtype == tensor.dtype
     schedule = again(LinearSchedule(1.0, 0.0, 0.5))
@@ -64,7 +64,7 @@ class Own(th.nn.Module):
     pass
 
 
-def test_what_only_a_pickle_holds_needs_trust():
+def test_objects_that_need_a_pickle_need_trust():
     for value in (Own, lambda x: x, partial(print, 1)):
         with pytest.raises(UntrustedError):
             again({"deep": [value]})
@@ -91,12 +91,12 @@ FORGED = [
 
 
 @pytest.mark.parametrize("forged", FORGED, ids=str)
-def test_forged_data_is_refused(forged):
+def test_forged_data_raises(forged):
     with pytest.raises(ValueError):
         decode(forged)
 
 
-def test_a_file_cannot_choose_what_is_imported():
+def test_a_file_cannot_choose_the_imported_module():
     program = "torch.utils.model_dump.__main__"
     with pytest.raises(ValueError, match=r"must name a class that agents are made of, got torch\.utils\.model_dump"):
         decode({KIND: "class", "module": program, "name": "Module"})
@@ -105,7 +105,7 @@ def test_a_file_cannot_choose_what_is_imported():
     assert issubclass(decode({KIND: "class", **optimizer}), th.optim.Optimizer)
 
 
-def test_a_pickle_is_named_and_not_run():
+def test_a_pickle_is_reported_and_not_executed():
     content = pickle.dumps(Runs())
     assert names_in(content) == ["posix.system"]
     with pytest.raises(UntrustedError, match=r"posix\.system"):

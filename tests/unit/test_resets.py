@@ -16,17 +16,17 @@ def test_gamma_is_annealed_geometrically_in_the_horizon():
     # 1 - γ from 0.03 to 0.003: half-way sqrt(0.03 * 0.003) = 0.00948683
     found = [annealed(updates, initial_gamma=0.97)[1] for updates in (0, 50)]
     assert found == pytest.approx([0.97, 0.99051317], rel=1e-7)
-    assert annealed(100, initial_gamma=0.97)[1] == 0.997  # to the last bit
+    assert annealed(100, initial_gamma=0.97)[1] == 0.997  # bit for bit
 
 
-def test_without_a_start_nothing_moves():
+def test_without_initial_values_nothing_is_annealed():
     assert annealed(20) == (3, 0.997)
 
 
 def test_when_a_reset_is_due():
     resets = Resets(ResetSchedule(interval=10, end=0.75))
     assert not resets.is_due(9, 1.0) and resets.is_due(10, 1.0) and resets.is_due(11, 0.5)
-    assert not resets.is_due(11, 0.25)  # three quarters of training are over
+    assert not resets.is_due(11, 0.25)  # three quarters of the training steps are done
     resets.done += [10, 25]
     assert not resets.is_due(34, 0.9) and resets.is_due(35, 0.9)
     resets.roll_back(25)

@@ -5,7 +5,7 @@ from sb3_eqr.common.replay.sum_tree import SumTree
 
 
 def leaves_at(priorities, masses):
-    """Which priority the running sum is in at each mass, by NumPy alone."""
+    """The index of the priority that each mass falls into, with NumPy alone."""
     return np.searchsorted(np.cumsum(priorities), masses, side="right")
 
 
@@ -20,8 +20,8 @@ def test_draws_follow_the_running_sum(capacity):
     assert np.array_equal(tree.sample(1000, uniforms), leaves_at(priorities, masses))
 
 
-def test_masses_on_the_edges_never_find_an_empty_leaf():
-    """Priorities are binary fractions, so that masses at, just below and just above every running sum are exact."""
+def test_masses_at_the_boundaries_never_select_a_leaf_of_priority_zero():
+    """Priorities are binary fractions, so masses at, just below and just above every running sum are exact."""
     rng = np.random.default_rng(0)
     for _ in range(5):
         priorities = np.where(rng.random(500) < 0.05, 2.0 ** rng.integers(-9, 0, 500), 0.0)
@@ -36,11 +36,11 @@ def test_masses_on_the_edges_never_find_an_empty_leaf():
         assert np.array_equal(found, leaves_at(priorities, masses)) and (tree.get(found) > 0).all()
 
 
-def test_rounding_does_not_lead_behind_the_last_priority():
+def test_rounding_does_not_select_beyond_the_last_priority():
     tree = SumTree(6)
     tree.set(np.array([1, 4]), np.array([0.1, 0.2]))  # 0.1 + 0.2 > 0.3
     assert tree.sample(1, np.array([np.nextafter(1.0, 0)])).tolist() == [4]
-    assert tree.sample(1, np.array([1.0])).tolist() == [4]  # a mass of the whole total
+    assert tree.sample(1, np.array([1.0])).tolist() == [4]  # a mass equal to the total
 
 
 def test_sums_do_not_drift():
@@ -62,5 +62,5 @@ def test_draws_are_proportional_and_stratified():
     tree.set(np.arange(4), np.array([1.0, 2.0, 0.0, 5.0]))
     rng = np.random.default_rng(0)
     counts = np.bincount(np.concatenate([tree.sample(8, rng.random(8)) for _ in range(500)]), minlength=4)
-    # Eight strata over a total of eight: each batch has exactly one, two, none and five.
+    # Eight strata over a total of eight: each batch draws the leaves exactly 1, 2, 0 and 5 times.
     assert counts.tolist() == [500, 1000, 0, 2500]
