@@ -1,11 +1,11 @@
 """
-Measuring EqR, and comparing it: ``sb3-eqr benchmark`` trains, evaluates and reports (docs/benchmark.md), ``load_reference``
-has published scores, ``load_scores`` those of a benchmark.
+The benchmark: ``sb3-eqr benchmark`` trains, evaluates and reports (docs/benchmark.md), ``load_reference`` loads published
+scores, ``load_scores`` those of a benchmark.
 
-``__main__`` reads a command. To run: ``suites`` and ``agents`` find what it names, ``runs`` plans a folder for each run,
-``dispatch`` hands them to Ray, ``training`` does one, with ``evaluation``. To report: ``scores`` reads what the runs wrote,
-``selection`` and ``comparison`` choose what can stand side by side, with ``reference`` for published scores, ``statistics``
-and ``analysis`` compute and say what it shows, ``tables``, ``figures`` and ``report`` write it.
+``__main__`` parses the command line. For ``run``, ``suites`` and ``agents`` look up the names, ``runs`` plans a folder per
+run, ``dispatch`` submits the runs to Ray, ``training`` executes one, with ``evaluation``. For ``report``, ``scores`` reads
+the runs' output, ``selection`` and ``comparison`` choose what can be compared, ``reference`` adds published scores,
+``statistics`` and ``analysis`` compute the results and put them into words, ``tables``, ``figures`` and ``report`` write them.
 """
 
 import importlib
@@ -16,7 +16,7 @@ __all__ = ["load_reference", "load_scores"]
 _MODULES = {"load_reference": "reference", "load_scores": "scores"}
 
 
-def __getattr__(name: str) -> Any:  # later: load_reference needs no RL Zoo
+def __getattr__(name: str) -> Any:  # imported on use: load_reference works without RL Zoo
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -13,16 +13,16 @@ from sb3_eqr.configurations import STOCK, configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
 
-WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change what is played
-CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms that take no discrete actions
-DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that take no others
+WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change the environment
+CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms without support for discrete actions
+DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that support discrete actions only
 
 
 class Agent(NamedTuple):
     """
-    :param name: as in tables: "qrdqn", "qrdqn:stock", "eqr_rainbow:se2+aet"
+    :param name: name in tables: "qrdqn", "qrdqn:stock", "eqr_rainbow:se2+aet"
     :param algo: RL Zoo's name of the algorithm
-    :param file: of hyperparameters
+    :param file: file of hyperparameters
     """
 
     name: str
@@ -32,15 +32,15 @@ class Agent(NamedTuple):
 
 def find_agent(text: str) -> Agent:
     """
-    :param text: ALGO or ALGO:ENTRIES. ALGO alone has RL Zoo's hyperparameters for a stock algorithm and ours for an EqR agent.
-        ENTRIES is "stock" (zoo_hyperparams/stock), the name of one of our files or the beginning of exactly one such name
+    :param text: ALGO or ALGO:ENTRIES. ALGO alone uses RL Zoo's hyperparameters for a stock algorithm, ours for an EqR agent.
+        ENTRIES is "stock" (zoo_hyperparams/stock), the name of one of our files, an unambiguous prefix of such a name
         ("mlp" for "mlp+aet+r"), or the path of a YAML file
-    :raises ValueError: for an algorithm or a file that there is not, with the nearest name
+    :raises ValueError: for an unknown algorithm or file, with the nearest name
     """
     register()
     algo, _, entries = text.partition(":")
     if algo not in ALGOS:
-        raise ValueError(f"--agents: {algo!r} is no algorithm.{nearest_name(algo, ALGOS)}")
+        raise ValueError(f"--agents: there is no algorithm {algo!r}.{nearest_name(algo, ALGOS)}")
     files = configuration_files()
     if not entries:
         own = files[algo] if algo in AGENTS else pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
@@ -56,23 +56,23 @@ def find_agent(text: str) -> Agent:
         entries = name = longer[0]
     if name not in files and longer:
         raise ValueError(
-            f"--agents: {text!r}: expected the beginning of one name, found {', '.join(sorted(longer))}. Write one of them."
+            f"--agents: {text!r} must be a prefix of one name, got one of {', '.join(sorted(longer))}. Choose one of them."
         )
     if name not in files:
         legal += [STOCK] if f"{STOCK}/{algo}" in files else []
-        raise ValueError(f"--agents: {text!r}: there are no such hyperparameters.{nearest_name(entries, legal)}")
+        raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
 
 
 def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:
     """
-    The agent's entry for a game, checked; leaves with a message if there is none or it has a mistake.
+    The agent's entry for a game, checked; exits with a message if it is missing or invalid.
 
     :param agent: the agent
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`; its preprocessing stands before the entry's
-    :param action_space: of the game
-    :return: the entry as it is written, with the steps, and no larger replay buffer than these can fill
-    :raises ValueError: if the agent cannot play this game, or plays another one than the suite says
+    :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`; its preprocessing overrides the entry's
+    :param action_space: the game's action space
+    :return: the entry as in the file, with the suite's steps, and a replay buffer no larger than these steps can fill
+    :raises ValueError: if the agent does not support the game's actions, or its entry changes the environment
     """
     steps, env_id, preprocessing = protocol["steps"], protocol["env_id"], protocol["preprocessing"]
     changes = {**preprocessing, "n_timesteps": steps}
@@ -81,14 +81,14 @@ def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces
     where = f"{agent.name}, {env_id}"
     if own := [key for key in WORLD if entry.get(key) is not None and key not in preprocessing]:
         raise ValueError(
-            f"{where}: expected the suite's game, found an entry with its own {', '.join(own)}. "
-            "All agents must play the same: name it under preprocessing in the suite (null for none)."
+            f"{where}: the entry must not change the suite's environment, got its own {', '.join(own)}. "
+            "Set it under preprocessing in the suite (null for none), so that all agents have the same environment."
         )
     kind = "discrete" if isinstance(action_space, spaces.Discrete) else "continuous"
     if agent.algo in (CONTINUOUS if kind == "discrete" else DISCRETE):
-        raise ValueError(f"{where}: expected a game that {agent.algo} can play, found {kind} actions. Leave the agent out.")
+        raise ValueError(f"{where}: {agent.algo} does not support {kind} actions. Leave the agent out.")
     if steps % entry.get("n_envs", 1):
-        raise ValueError(f"{where}: expected steps in whole rounds of its {entry['n_envs']} environments, found {steps} steps")
+        raise ValueError(f"{where}: steps must be a multiple of n_envs = {entry['n_envs']}, got {steps}.")
     default = inspect.signature(ALGOS[agent.algo]).parameters.get("buffer_size")
     if default is not None:
         entry["buffer_size"] = min(entry.get("buffer_size", default.default), max(steps, 1_000))

@@ -1,4 +1,4 @@
-"""The statistics of a comparison, each computed once, and what they say in words."""
+"""The statistics of a comparison, each computed once, and the sentences of the report about them."""
 
 import dataclasses
 import math
@@ -13,19 +13,19 @@ from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import SHOWN, PublishedMethod, load_reference, published_means
 from sb3_eqr.benchmark.tables import aggregate_means, distinct_best, number
 
-FEW_RUNS = 5  # below, the percentile bootstrap is far too narrow
+FEW_RUNS = 5  # with fewer, the intervals of the percentile bootstrap are far too narrow
 
 
 @dataclasses.dataclass(frozen=True)
 class Analysis:
     """
-    :param comparison: what is compared
+    :param comparison: the runs compared
     :param matrices: agent or reference -> (runs, games), normalised scores, games in alphabetical order
     :param aggregates: columns agent, metric, value, low, high
     :param means: rows games, columns published methods, raw mean scores
-    :param differences: of IQMs, against the first agent and against the best, see
+    :param differences: differences of IQMs from the first agent and from the best, see
         :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
-    :param improvements: against the first agent, see :func:`~sb3_eqr.benchmark.statistics.improvement_probabilities`
+    :param improvements: over the first agent, see :func:`~sb3_eqr.benchmark.statistics.improvement_probabilities`
     :param reps: bootstrap samples behind all intervals
     """
 
@@ -40,8 +40,8 @@ class Analysis:
 
 def analyse(comparison: Comparison, reps: int) -> Analysis:
     """
-    :param comparison: what is compared
-    :param reps: bootstrap samples
+    :param comparison: the runs to compare
+    :param reps: number of bootstrap samples
     """
     matrices = statistics.score_matrices(comparison.scores)
     baseline = comparison.agents[0]
@@ -63,8 +63,8 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
 
 def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.DataFrame:
     """
-    :return: rows games, columns methods, raw mean scores; without columns where a run has other steps than theirs, the suite
-        is not normalised by human scores, or a compared game has no published score
+    :return: rows games, columns methods, raw mean scores; no columns where a run's steps differ from the published methods',
+        the suite is not normalised by human scores, or a game has no published score
     """
     means = published_means(methods, comparison.games if comparison.has_published else [])
     return means if len(means) == len(comparison.games) else pd.DataFrame(index=comparison.games)
@@ -72,7 +72,7 @@ def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.
 
 def conclusion(analysis: Analysis) -> list[str]:
     """
-    :return: what the runs show, the most important first
+    :return: sentences on what the runs show, the most important first
     """
     comparison = analysis.comparison
     sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
@@ -88,7 +88,7 @@ def conclusion(analysis: Analysis) -> list[str]:
 
 def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
     """
-    :param row: of ``Analysis.differences``
+    :param row: a row of ``Analysis.differences``
     :return: a sentence on whether the runs distinguish the two agents
     """
     agent, other = comparison.label(row["agent"]), comparison.label(row["baseline"])
@@ -107,7 +107,7 @@ def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
 
 
 def _small(value: float) -> str:
-    """:return: two decimals, or as many as it takes to see a digit of a smaller number"""
+    """:return: two decimals, or as many as a smaller number needs for one significant digit"""
     return number(value, 2 if value >= 0.01 or value == 0 else min(6, 1 - math.floor(math.log10(value))))
 
 
@@ -118,17 +118,17 @@ def counted(count: int, noun: str) -> str:
 
 def notes(analysis: Analysis) -> list[str]:
     """
-    :return: sentences that a reader must know before any number
+    :return: caveats that readers need before the numbers
     """
     comparison = analysis.comparison
     found = [f"‡ {agent} was run under another protocol: {what}." for agent, what in comparison.differing.items()]
     found += comparison.notes
     if single := [agent for agent, matrix in analysis.matrices.items() if len(matrix) == 1]:
         verb = "has" if len(single) == 1 else "have"
-        found.append(f"{', '.join(single)} {verb} a single run per game: no intervals, and another run may differ.")
+        found.append(f"{', '.join(single)} {verb} a single run per game: no intervals, and another run may score differently.")
     if few := [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]:
         found.append(
-            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. A bootstrap of so few is narrower than it should be: "
+            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. Bootstrap intervals of so few runs are too narrow: "
             "trust the conclusion above rather than intervals that do not overlap."
         )
     return found
@@ -136,14 +136,13 @@ def notes(analysis: Analysis) -> list[str]:
 
 def table_notes(analysis: Analysis) -> list[str]:
     """
-    :return: what the table of games shows
+    :return: sentences on what the table of games shows
     """
     comparison = analysis.comparison
     found = [
-        "Raw scores: mean over runs ± standard deviation over runs. Bold: better than every other agent, by more than "
-        "chance explains.",
+        "Raw scores: mean ± standard deviation over runs. Bold: better than every other agent by more than chance explains.",
         "Below: aggregates of normalised scores over all runs and games, with 95% intervals; "
-        f"{comparison.above_one} are those with a mean above 1.",
+        f"{comparison.above_one} are games with a mean above 1.",
     ]
     if len(analysis.means.columns):
         sources = load_reference().drop_duplicates("method").set_index("method")["source"]
@@ -171,5 +170,5 @@ def aggregates_file(analysis: Analysis) -> pd.DataFrame:
 
 
 def all_of(values: Iterable[Any]) -> str:
-    """:return: different values, in their order"""
+    """:return: the distinct values, in order of appearance"""
     return ", ".join(dict.fromkeys(map(str, values)))

@@ -1,4 +1,4 @@
-"""From benchmark folders to what can be compared: the games that all agents have, their runs in common, one protocol."""
+"""Select from benchmark folders what can be compared: games and seeds that every agent has, under one protocol."""
 
 import dataclasses
 import pathlib
@@ -17,15 +17,15 @@ from sb3_eqr.benchmark.suites import Suite, nearest_name, read_suite
 @dataclasses.dataclass(frozen=True)
 class Comparison:
     """
-    :param suite: name of the suite, of several ones with "+"
-    :param unit: of normalised scores
-    :param source: of the bounds that scores are normalised by
+    :param suite: name of the suite; several names are joined by "+"
+    :param unit: unit of the normalised scores
+    :param source: source of the bounds that scores are normalised by
     :param bounds: game -> (score that becomes 0, score that becomes 1)
-    :param games: that every agent has runs on, in the suite's order
-    :param agents: of the benchmark; the first is the one that the others are held against
-    :param scores: columns agent, game, seed, raw, score (normalised); the runs that are compared, agents and references
+    :param games: games that every agent has runs on, in the suite's order
+    :param agents: agents of the benchmark; the first is the baseline
+    :param scores: columns agent, game, seed, raw, score (normalised); the runs compared, of agents and references
     :param results: result.json of those runs
-    :param episodes: every episode of every finished run, as ``score_table`` gives them
+    :param episodes: every episode of every finished run, as ``score_table`` returns them
     :param differing: agent -> how its protocol differs from the others', where the comparison was forced
     :param notes: sentences on what was left out and why
     """
@@ -44,29 +44,29 @@ class Comparison:
 
     @property
     def human(self) -> bool:
-        """Whether 1 is human play on Atari, so that published scores can stand beside."""
+        """Whether a normalised score of 1 is a human tester's, as for published Atari scores."""
         return self.unit.startswith("human-normali")
 
     @property
     def above_one(self) -> str:
-        """What games with a mean above 1 are called."""
+        """The name of games with a mean above 1."""
         return "superhuman games" if self.human else "games above 1"
 
     @property
     def has_published(self) -> bool:
-        """Whether published scores are of as many steps as the runs."""
+        """Whether published scores are for as many steps as the runs."""
         return self.human and {result["protocol"]["steps"] for result in self.results} == {PUBLISHED_STEPS}
 
     def label(self, agent: str) -> str:
-        """:return: the agent's name, marked where its protocol is not that of the others"""
+        """:return: the agent's name, marked where its protocol differs from the others'"""
         return f"{agent} ‡" if agent in self.differing else agent
 
     def runs(self, agent: str) -> list[dict[str, Any]]:
-        """:return: the results of an agent; none of a reference"""
+        """:return: the results of an agent; an empty list for a reference"""
         return [result for result in self.results if result["agent"] == agent]
 
     def minutes(self, agent: str) -> float:
-        """:return: mean wall-clock time of a run; NaN of a reference"""
+        """:return: mean wall-clock time of a run; NaN for a reference"""
         times = [result["wall_clock_s"] for result in self.runs(agent)]
         return float(np.mean(times)) / 60 if times else np.nan
 
@@ -87,22 +87,22 @@ def compare(
     baseline: str | None = None,
 ) -> Comparison:
     """
-    :param folders: of benchmarks
+    :param folders: folders of benchmarks
     :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.scores.read_runs`
-    :param force: compare agents with different protocols or games, too
-    :param agents: those to compare; none: all
-    :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first
+    :param force: also compare agents with different protocols or games
+    :param agents: the agents to compare; empty: all
+    :param baseline: the agent that the others are compared with; ``None``: the first stock one, or else the first
     :return: what the folders have in common
-    :raises ValueError: if that is nothing, or if comparing it would mislead
+    :raises ValueError: if they have nothing in common, or comparing it would mislead
     """
     if not folders:
-        raise ValueError("report: expected one benchmark folder or more, found none")
+        raise ValueError("folders must be at least one benchmark folder, got none.")
     suites = [_read_suite(folder) for folder in folders]
     results = _of_agents(_load(folders), [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
     games, chosen, notes = choose_runs(results, list(dict.fromkeys(g for suite in suites for g in suite.games)), force)
     if baseline is not None and baseline not in chosen:
-        raise ValueError(f"--baseline: expected one of {', '.join(chosen)}, found {baseline!r}")
+        raise ValueError(f"--baseline must be one of {', '.join(chosen)}, got {baseline!r}.")
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent))
     used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
     used.sort(key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"]))
@@ -110,9 +110,9 @@ def compare(
     differing = protocol_differences(used)
     if differing and not force:
         raise ValueError(
-            "protocol: expected the same for every run of a game, found "
+            "The protocol must be the same for every run of a game, got "
             f"{' '.join(f'{agent}: {what}.' for agent, what in differing.items())} "
-            "Choose with --agents, or pass --force to mark them in every table."
+            "Select agents with --agents, or pass --force to compare them, marked in every table."
         )
     comparison = Comparison(
         suite=" + ".join(dict.fromkeys(suite.name for suite in suites)),
@@ -128,18 +128,18 @@ def compare(
         notes=notes,
     )
     if comparison.human and not comparison.has_published:
-        notes.append("Published scores are of 100,000 training steps, these are not: they do not stand beside.")
+        notes.append("Published scores are for 100,000 training steps, these runs are not: published scores are left out.")
     return dataclasses.replace(comparison, scores=_scores(comparison, references, suites))
 
 
 def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suites: list[Suite]) -> pd.DataFrame:
-    """:return: columns agent, game, seed, raw, score; a note for each reference with runs to spare"""
+    """:return: columns agent, game, seed, raw, score; adds a note for each reference with unused runs"""
     final = score_table(comparison.results).query("kind == 'final'")
     tables = [final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()]
     known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
     for name, path in references.items():
         if name in comparison.agents:
-            raise ValueError(f"reference {name}: expected a name that no agent has, found the agent {name}. Rename it.")
+            raise ValueError(f"--reference must have a name that no agent has, got {name!r}. Rename it.")
         runs = read_runs(path, name, comparison.games, known)
         comparison.notes.extend([runs.attrs["note"]] if "note" in runs.attrs else [])
         tables.append(runs.rename(columns={"score": "raw"}))
@@ -150,8 +150,8 @@ def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suit
 
 def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[str, Any]]:
     """
-    :param agents: those to keep; none: all
-    :raises ValueError: for one that has no finished run
+    :param agents: the agents to keep; empty: all
+    :raises ValueError: for an agent without finished runs
     """
     there = {result["agent"] for result in results}
     if missing := [agent for agent in agents if agent not in there]:
@@ -162,29 +162,29 @@ def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[st
 def _read_suite(folder: pathlib.Path) -> Suite:
     path = pathlib.Path(folder) / "suite.yml"
     if not path.is_file():
-        raise ValueError(f"{folder}: expected a folder of sb3-eqr benchmark run, with suite.yml in it, found none")
+        raise ValueError(f"{folder} must be a folder of sb3-eqr benchmark run, got one without suite.yml.")
     return read_suite(path)
 
 
 def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
     """
-    :raises ValueError: for a folder without finished runs, and for a run that is in two folders
+    :raises ValueError: for a folder without finished runs, or a run that is in two folders
     """
     results: list[dict[str, Any]] = []
     where: dict[tuple, pathlib.Path] = {}
     for folder in map(pathlib.Path, folders):
         found = load_results(folder)
         if not found:
-            raise ValueError(f"{folder}: expected finished runs, found none. Run sb3-eqr benchmark run first.")
+            raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
         for result in found:
             run = (result["agent"], result["game"], result["seed"])
             if run in where:
                 raise ValueError(
-                    f"{run[0]}, {run[1]}, seed {run[2]}: expected each run once, found it in {where[run]} and {folder}. "
-                    "Report one of the folders."
+                    f"{run[0]}, {run[1]}, seed {run[2]} must be in one folder, got it in {where[run]} and {folder}. "
+                    "Report only one of them."
                 )
             if not any(evaluation["kind"] == "final" and evaluation["scores"] for evaluation in result["evaluations"]):
-                raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]}: expected a final evaluation, found none")
+                raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]} must have a final evaluation, got none.")
             where[run] = folder
         results += found
     return results
@@ -193,27 +193,27 @@ def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
 def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
     """
     :return: game -> (score that becomes 0, score that becomes 1)
-    :raises ValueError: where a game has none, or folders do not agree on them
+    :raises ValueError: if a game has no bounds, or folders disagree on them
     """
     bounds: dict[str, tuple[float, float]] = {}
     for suite in suites:
         unit = suites[0].normalisation.unit
         if suite.normalisation.unit != unit:
             raise ValueError(
-                f"normalisation: expected one unit, found {unit!r} in {suites[0].name} and "
-                f"{suite.normalisation.unit!r} in {suite.name}. Report them apart."
+                f"The unit of normalisation must be the same in all folders, got {unit!r} in {suites[0].name} and "
+                f"{suite.normalisation.unit!r} in {suite.name}. Report them separately."
             )
         for game, (low, high) in suite.normalisation.scores.items():
             if bounds.setdefault(game, (low, high)) != (low, high):
                 raise ValueError(
-                    f"normalisation of {game}: expected two bounds, the same in all folders, found {low} and {high} in "
+                    f"The bounds of {game} must be the same in all folders, got {low} and {high} in "
                     f"{suite.name} and {bounds.get(game)} before. Correct suite.yml."
                 )
     for game in dict.fromkeys(result["game"] for result in results):
         if game not in bounds:
             raise ValueError(
-                f"{game}: expected a game that {suites[0].name} has bounds to normalise for ({', '.join(bounds) or 'none'}), "
-                f"found none for it.{nearest(game, {plain_game(known): known for known in bounds})} "
+                f"{game} has no bounds for normalisation in {suites[0].name}, which has them for "
+                f"{', '.join(bounds) or 'no game'}.{nearest(game, {plain_game(known): known for known in bounds})} "
                 "Correct the name, or add the game under normalisation: scores in suite.yml."
             )
     return bounds

@@ -1,4 +1,4 @@
-"""Finishing all runs of a benchmark: a task of Ray for each, and the table that shows where they are."""
+"""Execute all runs of a benchmark, each as a Ray task, and show a table of their progress."""
 
 import contextlib
 import datetime
@@ -19,14 +19,14 @@ from sb3_eqr.common.files import atomic_write
 
 ATTEMPTS = 2  # a run that crashes is retried once
 REFRESH_SECONDS = 2.0
-BUSY_SECONDS = 5.0  # before a run that another process has is asked for again
+BUSY_SECONDS = 5.0  # before retrying a run that another process holds
 
 
 def make_table(runs: list[Run], states: list[State]) -> Table:
     """
-    :param runs: of the benchmark
-    :param states: as many
-    :return: a row per agent, and one for all
+    :param runs: runs of the benchmark
+    :param states: their states
+    :return: a row per agent, and one for all agents
     """
     table = Table(box=None, pad_edge=False, caption_justify="left")
     for column in ("agent", "done", "running", "waiting", "failed", "steps", "steps/s"):
@@ -54,24 +54,24 @@ def run_benchmark(
     console: Console | None = None,
 ) -> list[Run]:
     """
-    Finish all runs: those that are finished are skipped, interrupted ones resume from their last checkpoint, those that
-    another process has are waited for, one that crashes twice is left while the others continue.
+    Execute all runs: finished runs are skipped, interrupted ones resume from their last checkpoint, runs that another
+    process holds are waited for. A run that crashes twice has failed; the others continue.
 
-    :param runs: of the benchmark
-    :param settings: of all runs
-    :param address: of a Ray cluster that sees the benchmark's folder; ``None``: this machine
+    :param runs: runs of the benchmark
+    :param settings: settings of all runs
+    :param address: address of a Ray cluster that can access the benchmark's folder; ``None``: this machine
     :param cpus_per_run: CPUs that Ray reserves for a run
-    :param gpus_per_run: GPUs, such as 0.1 for ten runs on each
-    :param console: where the table is shown
+    :param gpus_per_run: GPUs that Ray reserves for a run, such as 0.1 for ten runs per GPU
+    :param console: where to print the table
     :return: the runs that failed
-    :raises ImportError: without Ray
-    :raises ConnectionError: if there is no cluster at the address
-    :raises ValueError: if no machine of the cluster can hold a run, which would wait forever
+    :raises ImportError: if Ray is not installed
+    :raises ConnectionError: if no cluster answers at the address
+    :raises ValueError: if no machine of the cluster has the resources of a run, which would wait forever
     """
     console = console or Console()
     waiting = [run for run in runs if run.state().name != "done"]
     if len(waiting) < len(runs):
-        console.print(f"{len(runs) - len(waiting)} of {len(runs)} runs are finished already.")
+        console.print(f"{len(runs) - len(waiting)} of {len(runs)} runs are already finished.")
     if not waiting:
         return []
     console.print("Connecting to Ray ..." if address else "Starting Ray ...")
@@ -80,7 +80,7 @@ def run_benchmark(
         for name, flag, needed in (("CPU", "--cpus-per-run", cpus_per_run), ("GPU", "--gpus-per-run", gpus_per_run)):
             there = max((node["Resources"].get(name, 0) for node in ray.nodes() if node["Alive"]), default=0)
             if needed > there:
-                raise ValueError(f"{flag}: expected at most the {there:g} {name}s of the largest machine, found {needed:g}")
+                raise ValueError(f"{flag} must be <= {there:g}, the {name}s of the largest machine, got {needed:g}.")
         task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=0)(execute)
         return finish(ray, task, runs, waiting, settings, console)
     finally:
@@ -88,21 +88,21 @@ def run_benchmark(
 
 
 def _start_ray(address: str | None) -> Any:
-    """The module, connected to the cluster at the address, or to one that it starts on this machine."""
+    """:return: the module ``ray``, connected to the cluster at the address, or to a new one on this machine"""
     try:
         import ray
     except ImportError as error:
         raise ImportError('benchmark run needs Ray: pip install ".[benchmark]" in a clone of the repository') from error
     host, _, port = (address or "").rpartition(":")
-    if host and port.isdigit() and "/" not in host:  # else "auto", or another form of Ray's
+    if host and port.isdigit() and "/" not in host:  # else "auto", or another of Ray's forms
         try:
             socket.create_connection((host, int(port)), timeout=5).close()
-        except OSError as error:  # for which Ray would wait minutes and then end the process
+        except OSError as error:  # Ray would wait for minutes and then exit the process
             raise ConnectionError(
-                f"--address: no Ray cluster answers at {address} ({error}). Start one: ray start --head"
+                f"--address: no Ray cluster answers at {address} ({error}). Start one with ray start --head."
             ) from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray's own warning asks for
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # as Ray's own warning recommends
     local: dict[str, Any] = {} if address else {"include_dashboard": False}
     ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
     return ray
@@ -110,17 +110,17 @@ def _start_ray(address: str | None) -> Any:
 
 def finish(ray: Any, task: Any, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
     """
-    :param ray: the module, connected
-    :param task: the remote function of a run
-    :param runs: of the benchmark
-    :param waiting: those that are not finished
-    :param settings: of all runs
-    :param console: where the table is shown
+    :param ray: the module, connected to a cluster
+    :param task: the remote function that executes a run
+    :param runs: runs of the benchmark
+    :param waiting: the runs that are not finished
+    :param settings: settings of all runs
+    :param console: where to print the table
     :return: the runs that failed
     """
     states = [run.state() for run in runs]
     running = {task.remote(run, settings): run for run in waiting}
-    busy: list[tuple[float, Run]] = []  # when to ask again
+    busy: list[tuple[float, Run]] = []  # when to retry
     crashes: Counter[str] = Counter()
     failed = []
     with Live(make_table(runs, states), console=console, auto_refresh=False, transient=True) as live:
@@ -156,12 +156,12 @@ def finish(ray: Any, task: Any, runs: list[Run], waiting: list[Run], settings: S
 def _note_crash(run: Run, error: Exception, is_lost: bool, console: Console) -> None:
     cause = getattr(error, "cause", None) or error
     reason = " ".join([type(cause).__name__, *str(cause).strip().splitlines()[-1:]])
-    _say(console, f"{run.label}: crashed ({reason}). {f'See {run.folder / ERROR}' if is_lost else 'Trying once more.'}")
-    if is_lost and not (run.folder / ERROR).is_file():  # it was killed before it could say anything
+    _say(console, f"{run.label}: crashed ({reason}). {f'See {run.folder / ERROR}' if is_lost else 'Retrying once.'}")
+    if is_lost and not (run.folder / ERROR).is_file():  # killed before it could write one
         with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
             file.write(str(error).encode())
 
 
 def _say(console: Console, text: str) -> None:
-    """A line above the table."""
+    """Print a line above the table."""
     console.print(text, soft_wrap=True, markup=False, highlight=False)

@@ -1,6 +1,6 @@
 """
-The evaluation protocol: whole episodes of a batch of environments, a fixed number of each, raw scores. A ``protocol`` is that
-of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`.
+The evaluation protocol: full episodes in a batch of environments, a fixed number per environment, raw scores. For the keys
+of a ``protocol`` see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`.
 """
 
 import copy
@@ -21,20 +21,20 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.envs.atari_batch import AtariBatch, has_atari_batch
 
-FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation plays other games than training, and than that of another seed
-# What AtariBatch plays: the wrapper of the suite atari100k, for evaluation.
+FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation shares no episodes with training, nor with another run's evaluation
+# The preprocessing that AtariBatch implements: the evaluation wrapper of the suite atari100k.
 WHOLE_ATARI_GAMES = {"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}], "frame_stack": 4}
-N_TURNS = 2  # batches: while the emulator plays one, the agent acts in the other
+N_TURNS = 2  # batches: while the emulator steps one, the agent chooses actions for the other
 
 
 class EpsilonGreedy:
     """
-    What SB3's ``evaluate_policy`` asks for its actions: the agent without its noise, and now and then a random action.
+    A policy for SB3's ``evaluate_policy``: the agent's deterministic action or, with probability ``epsilon``, a random one.
 
     :param model: the agent
     :param epsilon: probability of a random action
-    :param action_space: random actions are drawn from it
-    :param seed: of these draws
+    :param action_space: space to sample random actions from
+    :param seed: seed of the random actions
     """
 
     def __init__(self, model: BaseAlgorithm, epsilon: float, action_space: spaces.Space, seed: int):
@@ -53,10 +53,10 @@ class EpsilonGreedy:
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         :param observation: (n_envs, *obs_shape)
-        :param state: of a recurrent agent
+        :param state: hidden states of a recurrent agent
         :param episode_start: (n_envs,)
-        :param deterministic: has no effect
-        :return: actions, (n_envs, ...), and state
+        :param deterministic: ignored
+        :return: actions, (n_envs, ...), and hidden states
         """
         actions, state = self._model.predict(observation, state, episode_start, deterministic=True)
         for index in np.flatnonzero(self._rng.random(len(actions)) < self._epsilon):
@@ -65,7 +65,7 @@ class EpsilonGreedy:
 
 
 def preprocessing_of(protocol: dict[str, Any]) -> dict[str, Any]:
-    """:return: the preprocessing of evaluation"""
+    """:return: the preprocessing for evaluation"""
     return {**protocol["preprocessing"], **protocol["evaluation"]["preprocessing"]}
 
 
@@ -82,7 +82,7 @@ def make_game(protocol: dict[str, Any]) -> gym.Env:
 def check_game(protocol: dict[str, Any]) -> spaces.Space:
     """
     :return: the action space
-    :raises ValueError: if evaluation would not see whole games and raw scores
+    :raises ValueError: if evaluation would not see full episodes and raw scores
     """
     env = make_game(protocol)
     found = [kind.__name__ for kind in (ClipRewardEnv, EpisodicLifeEnv) if is_wrapped(env, kind)]
@@ -91,7 +91,7 @@ def check_game(protocol: dict[str, Any]) -> spaces.Space:
     env.close()
     if found:
         raise ValueError(
-            f"{protocol['env_id']}: expected evaluation on whole games with raw scores, found {', '.join(found)}. "
+            f"{protocol['env_id']}: evaluation must be on full episodes with raw scores, got {', '.join(found)}. "
             "Set preprocessing under evaluation in the suite, as atari100k in sb3_eqr/benchmark/suites.yml does."
         )
     return env.action_space
@@ -99,10 +99,10 @@ def check_game(protocol: dict[str, Any]) -> spaces.Space:
 
 def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: int) -> VecEnv:
     """
-    :param model: whose statistics normalise the observations, where it was trained so
-    :param seed: of the first environment; the others count up
+    :param model: the agent; if it was trained with normalised observations, its statistics are used
+    :param seed: seed of the first environment; the others' seeds count up from it
     """
-    # Monitor outside the wrappers: an episode is what the protocol says it is.
+    # Monitor is outside the wrappers, so that it sees the protocol's episodes.
     env = make_vec_env(make_game, n_envs=protocol["evaluation"]["n_envs"], seed=seed, env_kwargs={"protocol": protocol})
     trained = model.get_vec_normalize_env()
     if trained is not None:
@@ -121,11 +121,11 @@ def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: in
 
 class GamesInTurn:
     """
-    The games of one batch and the agent that plays them, until each game has been played as often as it should.
+    A batch of Atari games and the agent that plays them, until every game has finished its share of episodes.
 
-    :param batch: of games
+    :param batch: batch of games
     :param player: the agent
-    :param shares: number of episodes of each game, (n_envs,)
+    :param shares: number of episodes per game, (n_envs,)
     """
 
     def __init__(self, batch: AtariBatch, player: EpsilonGreedy, shares: np.ndarray):
@@ -140,12 +140,12 @@ class GamesInTurn:
 
     @property
     def playing(self) -> bool:
-        """Whether an episode is left."""
+        """Whether any episodes are left."""
         return bool(self._left.any())
 
     def act(self) -> None:
-        """Choose actions and send them to the emulator, which plays while Python does other work."""
-        # No thoughts on games that have had their share, but a recurrent agent keeps a state for each.
+        """Choose actions and send them to the emulator, which runs while Python does other work."""
+        # No actions are computed for games that are done, except for a recurrent agent, whose states cover all games.
         chosen = np.flatnonzero(self._left) if self._state is None else np.arange(self._batch.n_envs)
         actions = np.zeros(self._batch.n_envs, dtype=int)
         actions[chosen], self._state = self._player.predict(self._observations[chosen], self._state, self._starts[chosen])
@@ -155,7 +155,7 @@ class GamesInTurn:
         """
         Wait for the emulator.
 
-        :return: score and length of each episode that has ended, in its share
+        :return: score and length of each episode that has ended and counts
         """
         self._observations, rewards, self._starts = self._batch.receive()
         self._scores += rewards
@@ -169,11 +169,11 @@ class GamesInTurn:
 
 def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
-    Scores and lengths of whole episodes. Every environment plays its share of them and no more, so that short episodes are
-    not counted too often. Nothing of the agent changes, nor of the random generators.
+    Scores and lengths of full episodes. Every environment plays a fixed share of them, so that short episodes are not
+    overrepresented. Neither the agent nor the random generators change.
 
     :param n_episodes: number of episodes
-    :param seed: of the run
+    :param seed: seed of the run
     """
     play, n_threads = play_environments, th.get_num_threads()
     if fits_atari_batch(protocol, model):
@@ -190,7 +190,7 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
 def play_environments(
     model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int
 ) -> tuple[list[float], list[int]]:
-    """As :func:`evaluate`: any environments, one after the other in one process; ``seed`` is that of the first one."""
+    """:func:`evaluate` for any environments, stepped in turn in one process; ``seed`` is that of the first one."""
     env = make_evaluation_env(protocol, model, seed)
     try:
         player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
@@ -202,7 +202,7 @@ def play_environments(
 
 
 def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
-    """:return: whether ``AtariBatch`` shows the agent what the protocol says"""
+    """:return: whether ``AtariBatch`` implements the protocol for this agent"""
     trained = model.get_vec_normalize_env()
     return (
         protocol["env_id"].endswith("NoFrameskip-v4")
@@ -214,8 +214,8 @@ def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
 
 def play_atari(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
-    As :func:`evaluate`: Atari by :data:`WHOLE_ATARI_GAMES`, in two batches that take turns. While the emulator plays one, the
-    agent acts in the other.
+    :func:`evaluate` for Atari with the preprocessing :data:`WHOLE_ATARI_GAMES`, in two batches that take turns: while the
+    emulator steps one, the agent chooses actions for the other.
     """
     settings = protocol["evaluation"]
     n_envs = min(settings["n_envs"], n_episodes)

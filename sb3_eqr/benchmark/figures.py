@@ -1,5 +1,5 @@
 """
-The figures of a report, drawn by rliable and seaborn: counterparts of Figures 4 to 7 of the EqR paper, and curves along
+The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 to 7 of the EqR paper, and curves over
 training.
 """
 
@@ -25,11 +25,11 @@ from sb3_eqr.benchmark.tables import aggregate_means
 from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, settings
 
 DPI = 160
-N_THRESHOLDS = 81  # of performance profiles
-N_LOSSES = 20  # points of a curve of losses
-SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's own are for slides
+N_THRESHOLDS = 81  # points of a performance profile
+N_LOSSES = 20  # points of a loss curve
+SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's defaults are for slides
 INTERVALS = "95% stratified bootstrap intervals"
-# The agents of Figure 5 (b) and of Figure 6, by the names that agents have in a benchmark.
+# The agents of Figure 5 (b) and of Figure 6, by their names in a benchmark.
 ABLATIONS = {
     "loss_components": (r"(eqr_\w+):se2\+aet.*", "Losses", SHOWN_LOSSES, "losses, as in Figure 5 (b) of the EqR paper"),
     "groups": (r"(eqr_\w+):(mlp|t2|se2|gl2)\+aet\+r", "Groups", SHOWN_GROUPS, "group, as in Figure 6 of the EqR paper"),
@@ -38,9 +38,9 @@ ABLATIONS = {
 
 class ReportFigure(NamedTuple):
     """
-    :param name: of the file, without suffix
+    :param name: name of the file, without suffix
     :param title: heading in the report
-    :param caption: what is shown, plain text
+    :param caption: plain text
     """
 
     name: str
@@ -50,18 +50,18 @@ class ReportFigure(NamedTuple):
 
     @staticmethod
     def encoded(png: bytes) -> str:
-        """For the page."""
+        """:return: the image in base64, for the page"""
         return base64.b64encode(png).decode()
 
     @staticmethod
     def width(png: bytes) -> int:
-        """In pixels of the page, a hundred an inch: letters as large as the text's notes."""
+        """:return: width in pixels of the page, 100 per inch, at which letters are as large as those of the page's notes"""
         return 100 * int.from_bytes(png[16:20], "big") // DPI
 
 
 def to_png(shown: ReportFigure) -> bytes:
     """
-    :return: the same bytes for the same figure, which is closed
+    :return: the figure as PNG, the same bytes for the same figure; the figure is closed
     """
     file = io.BytesIO()
     for ax in shown.figure.axes:
@@ -74,10 +74,10 @@ def to_png(shown: ReportFigure) -> bytes:
 
 def all_figures(analysis: Analysis) -> list[ReportFigure]:
     """
-    :return: the figures that have something to show
+    :return: the figures for which there is data
     """
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
-    best = "Best is a high IQM, median and mean and a low optimality gap, as Figure 5 (a) of the EqR paper."
+    best = "Higher is better for IQM, median and mean, lower for the optimality gap; as Figure 5 (a) of the EqR paper."
     with settings():
         return [
             _profiles(analysis, style),
@@ -90,7 +90,7 @@ def all_figures(analysis: Analysis) -> list[ReportFigure]:
 
 
 def _bands(analysis: Analysis, beginning: str) -> str:
-    """:return: a sentence on the intervals, "" where all agents have a single run"""
+    """:return: a sentence on the intervals, "" if all agents have a single run"""
     return "" if analysis.aggregates["low"].isna().all() else f" {beginning} {INTERVALS}."
 
 
@@ -101,7 +101,7 @@ def _legend(figure: Figure, style: Mapping[str, Look]) -> None:
 
 def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
     """
-    :return: (n,) where profiles are evaluated: from 0, or below where many scores are, to where few scores are left
+    :return: (n,) thresholds of the profiles: from 0, or lower if many scores are, to where few scores are left
     """
     scores = np.concatenate([matrix.ravel() for matrix in matrices.values()])
     low = min(0.0, float(np.quantile(scores, 0.1)))
@@ -129,8 +129,8 @@ def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
             line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
     _legend(figure, style)
     caption = (
-        "Fraction of runs (left) and of games, by their mean over runs (right), above a score, as Figure 4 of the EqR paper. "
-        f"The higher the curve, the better.{_bands(analysis, 'Bands are pointwise')}"
+        "Fraction of runs (left) and of games, by their mean over runs (right), that score above τ, as Figure 4 of the EqR "
+        f"paper. Higher curves are better.{_bands(analysis, 'Bands are pointwise')}"
     )
     return ReportFigure("profiles", "Performance profiles", caption, figure)
 
@@ -167,8 +167,8 @@ def _intervals(
     caption = f"{explained} Over all runs and games.{_bands(analysis, 'Bars are')}"
     if len(known):
         caption += (
-            " Points without a bar are published game means, over as many runs as named. The IQM and the optimality gap of "
-            "game means are not quite those of runs."
+            " Points without a bar are from published game means, over as many runs as named. The IQM and optimality gap of "
+            "game means differ slightly from those of runs."
         )
     return ReportFigure(name, title, caption, figure)
 
@@ -204,11 +204,11 @@ def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportF
         right_ylabel="",
         **SIZES,
     )
-    figure.axes[-1].set_yticks([])  # the baseline again and again
+    figure.axes[-1].set_yticks([])  # the baseline's name, repeated in every row
     ax.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
     ax.set_xlim(-0.02, 1.02)
     caption = (
-        f"How likely a run of an agent scores higher than one of {baseline}, the baseline (--baseline, or the "
+        f"How likely a run of an agent scores higher than one of the baseline, {baseline} (--baseline, or the "
         f"first stock agent), averaged over games.{_bands(analysis, 'Bars are')}"
     )
     return [ReportFigure("improvement", "Probability of improvement", caption, figure)]
@@ -216,15 +216,15 @@ def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportF
 
 def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """
-    :return: agent -> fractions of the training steps (points,), normalised scores (runs, games, points); without agents whose
-        runs share fewer than two points
+    :return: agent -> fractions of the training steps (points,), normalised scores (runs, games, points); agents whose runs
+        have fewer than two points in common are left out
     """
     curves = {}
     for agent in comparison.agents:
         by_run = {}
         for run in comparison.runs(agent):
             steps, raw = evaluation_curve(run)
-            shares = np.round(steps / steps[-1], 2)  # games may differ in steps, and a curve's points in rounding
+            shares = np.round(steps / steps[-1], 2)  # games may differ in steps, and the points of curves by rounding
             by_run[run["seed"], run["game"]] = pd.Series(comparison.normalize(run["game"], raw), index=shares)
         table = pd.DataFrame(by_run).dropna()  # points by runs
         if len(table) > 1:
@@ -240,7 +240,7 @@ def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[Re
     if not curves:
         return []
     steps = {result["protocol"]["steps"] for result in comparison.results}
-    whole, axis = (steps.pop() / 1_000, "training steps (thousands)") if len(steps) == 1 else (1.0, "share of the steps")
+    whole, axis = (steps.pop() / 1_000, "training steps (thousands)") if len(steps) == 1 else (1.0, "fraction of the steps")
     figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
     shown = {}
     for agent, (fractions, scores) in curves.items():
@@ -262,15 +262,15 @@ def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[Re
         ax.get_lines()[-1].set_linestyle(look.line)
     ax.set_xlim(left=0)
     _legend(figure, shown)
-    caption = "IQM of evaluations along training; the last point is the final evaluation."
+    caption = "IQM of the evaluations during training; the last point is the final evaluation."
     caption += _bands(analysis, "Bands are pointwise")
     return [ReportFigure("sample_efficiency", "Sample efficiency", caption, figure)]
 
 
 def learning_curves(comparison: Comparison) -> pd.DataFrame:
     """
-    :return: columns game, agent, seed, step, value: raw mean scores at the evaluations along training; without the agents
-        that were evaluated at the end only
+    :return: columns game, agent, seed, step, value: raw mean scores of the evaluations during training; runs that were
+        evaluated only at the end are left out
     """
     frames = []
     for run in comparison.results:
@@ -282,8 +282,8 @@ def learning_curves(comparison: Comparison) -> pd.DataFrame:
 
 def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
     """
-    :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21 as far as the agent has them, means over
-        twentieths of the training; without the agents that have neither
+    :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21, or the one of them that the agent has,
+        averaged over twentieths of the training; agents with neither are left out
     """
     frames = []
     for run in comparison.results:
@@ -310,18 +310,18 @@ def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[R
             "Learning curves",
             learning_curves(comparison),
             "mean raw score",
-            "Raw scores of evaluations along training.",
+            "Raw scores of the evaluations during training.",
         ),
         (
             "symmetry_losses",
             "Symmetry losses",
             symmetry_losses(comparison),
             "$L_{AET} + L_{GET}$",
-            "L_AET + L_GET along training, as Figure 7 of the EqR paper; the one that an agent has where it has not both.",
+            "L_AET + L_GET during training, as Figure 7 of the EqR paper; for agents with only one of them, that one.",
         ),
     ):
         if len(table):
-            band = " Means over runs within one standard deviation."
+            band = " Means over runs ± one standard deviation."
             band = band if table["seed"].nunique() > 1 else " A single run each."
             shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
             found.append(ReportFigure(name, title, caption + band, _small_multiples(table, ylabel, shown)))
@@ -329,7 +329,7 @@ def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[R
 
 
 def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]) -> Figure:
-    """A panel per game: mean over runs, and their standard deviation."""
+    """A panel per game: mean and standard deviation over runs."""
     grid = sns.relplot(
         table,
         x="step",

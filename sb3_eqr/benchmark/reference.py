@@ -1,4 +1,4 @@
-"""Published scores on Atari 100K, as figures with their source."""
+"""Published scores on Atari 100K, with their sources."""
 
 import difflib
 import pathlib
@@ -8,24 +8,24 @@ from typing import NamedTuple
 import pandas as pd
 
 RANDOM, HUMAN = "Random", "Human"  # the two methods that scores are normalised by
-PUBLISHED_STEPS = 100_000  # of the agents whose scores are bundled
+PUBLISHED_STEPS = 100_000  # training steps of the bundled scores
 
 
 class PublishedMethod(NamedTuple):
-    """How a method of :func:`load_reference` is shown beside the runs of a benchmark."""
+    """How a method of :func:`load_reference` is shown next to the runs of a benchmark."""
 
     method: str
     label: str
-    runs: int  # that the published means are over, which the EqR paper tells in the captions of its tables
-    most: int | None = None  # where games differ in it
+    runs: int  # behind each published mean; for the EqR paper, from the captions of its tables
+    most: int | None = None  # the maximum, where the number differs between games
 
     @property
     def n_runs(self) -> str:
-        """In words."""
+        """The number of runs in words."""
         return f"{self.runs} runs" if self.most is None else f"{self.runs} to {self.most} runs"
 
 
-# The EqR paper's own agents by their losses, and the methods they are usually held against, from the source with most runs.
+# The EqR paper's agents by their losses, and the methods they are usually compared with, from the source with the most runs.
 SHOWN = (
     PublishedMethod("EqR [EqR Tab4]", "EqR (paper)", 10),
     PublishedMethod("EqR, L_{GET} [EqR Tab4]", "EqR, GET (paper)", 10),
@@ -49,44 +49,44 @@ def load_reference() -> pd.DataFrame:
     """
     Mean scores of published methods on the 26 games of Atari 100K.
 
-    :return: columns method, game, runs (how many the mean is over; 1 where the source gives the mean alone), mean, sd (over
-        runs; NaN where unknown), source; among the methods are "Random" and "Human"
+    :return: columns method, game, runs (number of runs behind the mean; 1 where the source gives only the mean), mean, sd
+        (over runs; NaN where unknown), source; the methods include "Random" and "Human"
     """
     return pd.read_csv(pathlib.Path(__file__).with_name("reference_scores.csv"))
 
 
 def plain_game(name: str) -> str:
     """
-    :param name: as any source writes it: "BankHeist", "bank_heist", "Bank Heist"
-    :return: "bankheist", as in the bundled scores
+    :param name: name of a game in any spelling: "BankHeist", "bank_heist", "Bank Heist"
+    :return: its spelling in the bundled scores: "bankheist"
     """
     return name.replace("_", "").replace(" ", "").lower()
 
 
 def match_games(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
     """
-    :param names: of games, as a source writes them
-    :param known: the names to match them to, regardless of case, "_" and spaces
+    :param names: names of games in any spelling
+    :param known: the names to match them to, ignoring case, "_" and spaces
     :return: name -> known name
-    :raises ValueError: for a name that matches none, with the nearest; and for two that match the same
+    :raises ValueError: for a name without a match, with the nearest one, and for two names with the same match
     """
     by_plain = {plain_game(game): game for game in known}
     found: dict[str, str] = {}
     for name in names:
         plain = plain_game(name)
         if plain not in by_plain:
-            raise ValueError(f"game: expected one of {', '.join(by_plain.values())}, found {name!r}.{nearest(name, by_plain)}")
+            raise ValueError(f"game must be one of {', '.join(by_plain.values())}, got {name!r}.{nearest(name, by_plain)}")
         if by_plain[plain] in found.values():
-            raise ValueError(f"game: expected each game once, found {name!r} beside another spelling. Keep one of them.")
+            raise ValueError(f"Each game must be given once, got {name!r} in two spellings. Keep one of them.")
         found[name] = by_plain[plain]
     return found
 
 
 def nearest(name: str, by_plain: dict[str, str]) -> str:
     """
-    :param name: that was not found
-    :param by_plain: plain name -> name, of those that exist
-    :return: a sentence with the most similar name, "" where none is similar
+    :param name: an unknown name
+    :param by_plain: plain name -> name, for all known names
+    :return: a sentence with the most similar name, "" if none is similar
     """
     close = difflib.get_close_matches(plain_game(name), list(by_plain), n=1)
     return f" Did you mean {by_plain[close[0]]!r}?" if close else ""
@@ -94,8 +94,8 @@ def nearest(name: str, by_plain: dict[str, str]) -> str:
 
 def published_means(methods: Iterable[PublishedMethod], games: Iterable[str]) -> pd.DataFrame:
     """
-    :param methods: to look up
-    :param games: names in any spelling; those without published scores are left out
+    :param methods: methods to look up
+    :param games: names in any spelling; games without published scores are left out
     :return: rows games (as given), columns labels; raw mean scores
     """
     table = load_reference().pivot(index="game", columns="method", values="mean")

@@ -1,4 +1,4 @@
-"""The report of a benchmark: from folders of runs to a page, figures, tables and data files."""
+"""The report of a benchmark: a page, figures, tables and data files from folders of runs."""
 
 import importlib.metadata
 import io
@@ -45,16 +45,16 @@ def write_report(
     """
     Write report.html, its figures as PNG, table.md, table.tex, scores.csv, scores.parquet and aggregates.csv.
 
-    :param folders: of benchmarks, with suite.yml and runs/
+    :param folders: folders of benchmarks, with suite.yml and runs/
     :param references: name -> JSON file with the runs of another method, game -> raw scores
-    :param force: compare agents that ran under different protocols, and mark them, or that have not all games
-    :param output: folder to write into; it is made if there is none
-    :param agents: those to compare; none: all
-    :param baseline: the agent that the others are held against; ``None``: the first stock one, or else the first
-    :param command: that wrote it
+    :param force: also compare agents with different protocols, which are marked, or with missing games
+    :param output: output folder, created if needed
+    :param agents: the agents to compare; empty: all
+    :param baseline: the agent that the others are compared with; ``None``: the first stock one, or else the first
+    :param command: the command line of the report
     :param reps: bootstrap samples behind every interval
     :return: the path of report.html
-    :raises ValueError: where nothing can be compared, or comparing would mislead; the message says what to do
+    :raises ValueError: if nothing can be compared, or comparing would mislead; the message says what to do
     """
     comparison = compare(folders, references, force, agents, baseline)
     analysis = analyse(comparison, reps)
@@ -83,7 +83,7 @@ def write_report(
         commands=_commands(comparison, command),
         versions=all_of(f"{name} {importlib.metadata.version(name)}" for name in ("rliable", "numpy", "scipy", "pandas")),
     )
-    files["report.html"] = page.encode()  # last: who finds it finds the rest
+    files["report.html"] = page.encode()  # last: where it exists, so do the others
     for note in before:
         print(f"Note: {note}")
     for name, content in files.items():
@@ -93,11 +93,11 @@ def write_report(
 
 
 def _html(table: Table, kind: str = "numbers") -> Markup:
-    return Markup(to_html(table, kind))  # its cells are escaped
+    return Markup(to_html(table, kind))  # to_html escapes the cells
 
 
 def _lead(comparison: Comparison) -> str:
-    """What was measured, in two sentences."""
+    """:return: what was measured, in two sentences"""
     runs = sorted({len(comparison.runs(agent)) // len(comparison.games) for agent in comparison.agents})
     days = sorted(result["started"][:10] for result in comparison.results)
     per_game = counted(runs[0], "run") if len(runs) == 1 else f"{runs[0]} to {runs[-1]} runs"
@@ -110,7 +110,7 @@ def _lead(comparison: Comparison) -> str:
 
 def _data_files(episodes: pd.DataFrame, aggregates: pd.DataFrame) -> dict[str, bytes]:
     """
-    :return: name -> content; without scores.parquet where pandas finds nothing to write it with
+    :return: name -> content; without scores.parquet if pandas has no library to write it
     """
     files = {
         "scores.csv": episodes.to_csv(index=False).encode(),
@@ -131,7 +131,7 @@ def _table_files(analysis: Analysis, table: Table) -> dict[str, bytes]:
 
 
 def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
-    """Headings, and tables of what each agent ran with, and where."""
+    """:return: headings and tables: settings and machine of each agent"""
     rows = []
     for agent in comparison.agents:
         runs = comparison.runs(agent)
@@ -159,8 +159,8 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
 
 def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
     """
-    :param path: of the settings in a result
-    :return: a row per setting, a column per agent; the values of different runs beside each other
+    :param path: keys of the settings in a result
+    :return: a row per setting, a column per agent; where runs of an agent differ, all values separated by "/"
     """
 
     def of(run: dict[str, Any]) -> dict[str, str]:
@@ -179,7 +179,7 @@ def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
 
 
 def _commands(comparison: Comparison, command: str) -> list[str]:
-    """What repeats runs and report."""
+    """:return: the commands that reproduce the runs and the report"""
     commands = dict.fromkeys(result["command"] for result in comparison.results)
-    whole = [text for text in commands if "--suite" in text] or list(commands)  # not those that only resumed
+    whole = [text for text in commands if "--suite" in text] or list(commands)  # leave out commands that only resumed runs
     return [*whole, command]

@@ -1,4 +1,4 @@
-"""The runs of a benchmark as folders: what each is to do, and where it stands, the same for every process that looks."""
+"""The runs of a benchmark as folders, which hold each run's plan and state for every process."""
 
 import dataclasses
 import json
@@ -14,19 +14,19 @@ from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
 from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.common.files import atomic_write
 
-SUITE = "suite.yml"  # of the benchmark
-RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # of a run
-STARTS = "starts.txt"  # a line whenever a run is begun or resumed
+SUITE = "suite.yml"  # in the folder of the benchmark
+RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # in that of a run
+STARTS = "starts.txt"  # a line for each time that a run starts or resumes
 
 
 class Settings(Strict):
     """
-    What does not change a score.
+    Settings that do not affect the scores.
 
-    :param command: to repeat the benchmark
-    :param device: of PyTorch
-    :param n_threads: of PyTorch
-    :param checkpoint_seconds: between two checkpoints
+    :param command: command that reproduces the benchmark
+    :param device: PyTorch device
+    :param n_threads: number of PyTorch threads
+    :param checkpoint_seconds: seconds between checkpoints
     """
 
     command: str = ""
@@ -39,7 +39,7 @@ class State(NamedTuple):
     """
     :param name: "done", "running", "failed" or "waiting"
     :param step: training steps done
-    :param steps_per_second: 0 unless it is running
+    :param steps_per_second: 0 unless the run is running
     """
 
     name: str
@@ -52,13 +52,13 @@ class Run:
     """
     One agent on one game with one seed.
 
-    :param folder: of the run
+    :param folder: folder of the run
     :param agent: the agent
     :param suite: name of the suite
     :param game: name of the game
-    :param seed: of everything
-    :param protocol: of :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :param entry: of :func:`~sb3_eqr.benchmark.agents.hyperparameters`
+    :param seed: seed of agent, environments and evaluation
+    :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
+    :param entry: see :func:`~sb3_eqr.benchmark.agents.hyperparameters`
     """
 
     folder: pathlib.Path
@@ -71,11 +71,11 @@ class Run:
 
     @property
     def label(self) -> str:
-        """For messages."""
+        """The name of the run in messages."""
         return f"{self.agent.name}, {self.game}, seed {self.seed}"
 
     def description(self) -> dict[str, Any]:
-        """What was asked for, for ``run.json``."""
+        """:return: the content of ``run.json``: what was requested"""
         return {
             "agent": self.agent.name,
             "game": self.game,
@@ -86,7 +86,7 @@ class Run:
         }
 
     def state(self) -> State:
-        """Where it stands."""
+        """:return: the progress of the run"""
         steps = self.protocol["steps"]
         if (self.folder / RESULT).is_file():
             return State("done", steps, 0.0)
@@ -97,7 +97,7 @@ class Run:
         return State("failed" if (self.folder / ERROR).is_file() else "waiting", progress.get("step", 0), 0.0)
 
     def is_locked(self) -> bool:
-        """Whether a process has it."""
+        """:return: whether a process holds the run"""
         if not (self.folder / LOCK).is_file():
             return False
         try:
@@ -108,33 +108,33 @@ class Run:
 
 
 def to_json(value: Any) -> str:
-    """As it is written into files."""
+    """:return: the text that goes into files"""
     return json.dumps(value, indent=1, default=str)
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:
-    """Write a file beside ``path`` and rename it."""
+    """Write a temporary file next to ``path`` and rename it."""
     with atomic_write(path, "json") as file:
         file.write(to_json(value).encode())
 
 
 def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int) -> list[Run]:
     """
-    The runs of a benchmark; seeds come last, so that a benchmark that is stopped has whole tables of fewer seeds. Nothing
-    is written.
+    Plan the runs of a benchmark, without writing anything. The seed is the outermost loop, so that an interrupted benchmark
+    has complete tables of fewer seeds.
 
-    :param folder: of the benchmark
-    :param suite: what is played and how
-    :param agents: as users write them
-    :param n_seeds: seeds count from 0
-    :raises ValueError: for agents of the same name, or for runs that are there with another protocol
+    :param folder: folder of the benchmark
+    :param suite: the suite
+    :param agents: agents as given by the user
+    :param n_seeds: number of seeds, counted from 0
+    :raises ValueError: for two agents of the same name, or for runs that exist with other settings
     """
     if n_seeds < 1:
-        raise ValueError(f"--seeds: expected at least 1, found {n_seeds}")
+        raise ValueError(f"--seeds must be >= 1, got {n_seeds}.")
     found = [find_agent(text) for text in agents]
     names = [agent.name for agent in found]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"--agents: expected different agents, found {', '.join(sorted(twice))} more than once")
+        raise ValueError(f"--agents must be different agents, got {', '.join(sorted(twice))} more than once.")
     runs = []
     for game in suite.games:
         protocol = suite.protocol(game)
@@ -151,7 +151,7 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
 
 def _check_plan(run: Run) -> None:
     """
-    :raises ValueError: if the folder holds the same run, begun with other settings
+    :raises ValueError: if the folder holds the same run, started with other settings
     """
     path = run.folder / PLAN
     begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or run.is_locked()
@@ -163,22 +163,22 @@ def _check_plan(run: Run) -> None:
         for key in sorted(before.keys() | now.keys()):
             if before.get(key) != now.get(key):
                 raise ValueError(
-                    f"{run.folder}: expected {key} {now.get(key)!r}, found a run with {before.get(key)!r}. "
-                    "Scores of different settings do not compare: use another folder, or the same settings."
+                    f"{run.folder}: {key} must be {before.get(key)!r}, as when the run was started, got {now.get(key)!r}. "
+                    "Scores of different settings are not comparable: use another folder, or the same settings."
                 )
 
 
 def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
     """
-    Note in the folder what is to be run. Games that were there before stay.
+    Write the plan of the benchmark into its folder. Games that the folder already has are kept.
 
-    :raises ValueError: if the folder is of another suite
+    :raises ValueError: if the folder is for another suite
     """
     path = folder / SUITE
     if path.is_file():
         old = read_suite(path)
         if old.name != suite.name:
-            raise ValueError(f"{folder}: expected a benchmark of suite {suite.name!r}, found one of {old.name!r}")
+            raise ValueError(f"{folder} must hold a benchmark of suite {suite.name!r}, got {old.name!r}. Use another folder.")
         games = [*old.games, *(game for game in suite.games if game not in old.games)]
         scores = old.normalisation.scores | suite.normalisation.scores
         normalisation = suite.normalisation.model_copy(update={"scores": scores})
@@ -191,8 +191,8 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
 
 def read_plan(folder: pathlib.Path) -> list[Run]:
     """
-    :return: the runs that a folder holds
-    :raises ValueError: if it holds none
+    :return: the runs in a folder
+    :raises ValueError: if there are none
     """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/*/{PLAN}"), key=lambda path: (int(path.parent.name), path)):
@@ -202,7 +202,7 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
         runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], plan["protocol"], entry))
     if not runs:
         raise ValueError(
-            f"{folder}: expected the folder of a benchmark, found no runs in it. Start one: "
+            f"{folder} must be the folder of a benchmark, got one without runs. Start a benchmark with "
             "sb3-eqr benchmark run DIR --suite SUITE --agents AGENT ..."
         )
     return runs

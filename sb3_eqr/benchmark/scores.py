@@ -1,4 +1,4 @@
-"""Scores as data: what the runs of a benchmark have written, and those of other methods' runs from a file."""
+"""Scores as data: those of a benchmark's runs, and those of other methods' runs from a file."""
 
 import json
 import pathlib
@@ -25,9 +25,9 @@ def load_results(folder: pathlib.Path) -> list[dict[str, Any]]:
 
 def score_table(results: list[dict[str, Any]]) -> pd.DataFrame:
     """
-    :param results: of :func:`load_results`
-    :return: a row per episode: agent, game, seed, step, kind ("curve" or "final": evaluations; "training"), episode (counted
-        from 0 within an evaluation, or within training), score (raw), length (agent steps)
+    :param results: see :func:`load_results`
+    :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
+        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
     """
     frames = []
     for result in results:
@@ -41,25 +41,25 @@ def score_table(results: list[dict[str, Any]]) -> pd.DataFrame:
 
 def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
     """
-    Every episode of every finished run of a benchmark.
+    Load every episode of every finished run of a benchmark.
 
-    :param folder: of the benchmark
+    :param folder: folder of the benchmark
     :return: see :func:`score_table`
     :raises ValueError: for a folder without finished runs
     """
     results = load_results(pathlib.Path(folder))
     if not results:
-        raise ValueError(f"{folder}: expected the folder of a benchmark, found no finished run in it")
+        raise ValueError(f"{folder} must be the folder of a benchmark, got one without finished runs.")
     return score_table(results)
 
 
 def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """
-    :param result: of a run
-    :return: steps (points,), mean raw scores (points,) of its evaluations along training, the final one included
+    :param result: result of a run
+    :return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one
     """
     found: dict[int, float] = {}
-    for evaluation in sorted(result["evaluations"], key=lambda row: row["kind"] == "final"):  # the final one wins at its step
+    for evaluation in sorted(result["evaluations"], key=lambda row: row["kind"] == "final"):  # the final one overrides
         if evaluation["scores"]:
             found[evaluation["step"]] = float(np.mean(evaluation["scores"]))
     steps = sorted(found)
@@ -68,35 +68,35 @@ def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
 
 def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Iterable[str] = ()) -> pd.DataFrame:
     """
-    Scores of another method's runs, in the form rliable publishes them: {"Alien": [812.0, 640.5, ...], ...}.
+    Read scores of another method's runs, in rliable's format: {"Alien": [812.0, 640.5, ...], ...}.
 
     :param path: a JSON file: game -> raw scores, one per run
-    :param name: what to call the method
-    :param games: that are needed
-    :param others: further games that may be there and are left out
-    :return: columns agent, game, seed, score; as many runs on every game as the game with fewest has, the first ones; where
+    :param name: name of the method
+    :param games: required games
+    :param others: other games that the file may contain and that are left out
+    :return: columns agent, game, seed, score; for every game the first runs, as many as the game with the fewest has; if
         that leaves some out, ``attrs["note"]`` says so
-    :raises ValueError: for a file that is no JSON or has another form, and for missing and unknown games
+    :raises ValueError: for a file that is not JSON or has another form, and for missing and unknown games
     """
     games = list(games)
-    expected = f'reference {name}, {path}: expected {{"Game": [score, score, ...], ...}} with a raw score per run'
+    expected = f'--reference {name}: {path} must contain {{"Game": [score, score, ...], ...}} with a raw score per run'
     try:
         content = RUNS.validate_json(pathlib.Path(path).read_bytes())
     except OSError as error:
-        raise ValueError(f"{expected}, found no file to read: {error}") from error
+        raise ValueError(f"{expected}, got no readable file: {error}") from error
     except ValidationError as error:
         mistake = error.errors()[0]
         where = "".join(f"{place}: " for place in mistake["loc"])
-        raise ValueError(f"{expected}, found {where}{mistake['msg']}. Write its runs as lists of finite numbers.") from error
+        raise ValueError(f"{expected}, got {where}{mistake['msg']}. Write its runs as lists of finite numbers.") from error
     try:
         matched = match_games(content, {plain_game(game): game for game in [*others, *games]}.values())
     except ValueError as error:
-        raise ValueError(f"reference {name}, {path}: {error} Correct the name or take the game out.") from error
+        raise ValueError(f"--reference {name}: {path}: {error} Correct the name or remove the game.") from error
     missing = [game for game in games if game not in matched.values()]
     unused = [given for given, game in matched.items() if game not in games]
     if missing:
         raise ValueError(
-            f"reference {name}, {path}: expected scores for {', '.join(games)}, found none for {', '.join(missing)}"
+            f"--reference {name}: {path} must contain scores for {', '.join(games)}, got none for {', '.join(missing)}"
             f"{f' (not needed: {chr(44).join(unused)})' if unused else ''}. "
             "Add them or report without this reference."
         )
@@ -106,5 +106,5 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
     table = pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
     if most := max(map(len, wanted.values())) - runs:
         fewest = next(game for game, scores in wanted.items() if len(scores) == runs)
-        table.attrs["note"] = f"{name}: its first {runs} runs, as many as {fewest} has; other games have up to {most} more."
+        table.attrs["note"] = f"{name}: first {runs} runs only, as many as {fewest} has; other games have up to {most} more."
     return table

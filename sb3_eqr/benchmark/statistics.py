@@ -1,7 +1,7 @@
 """
-Aggregate scores as rliable defines them (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264), each as a value with the ends
-of its 95 % interval. rliable draws the bootstrap samples; all of them are aggregated at once, a hundredth of the time of its
-own loop. Intervals of a single run are NaN.
+Aggregate scores as rliable defines them (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264), each with its 95 % interval.
+rliable draws the bootstrap samples; aggregating all of them at once takes a hundredth of the time of rliable's loop. The
+intervals of a single run are NaN.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from scipy.stats import trim_mean
 
 CONFIDENCE = 0.95
-REPS = 2_000  # bootstrap samples, stratified by game, as rliable's profiles
+REPS = 2_000  # bootstrap samples, stratified by game, as for rliable's profiles
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]  # value, low, high
 
 
@@ -37,9 +37,9 @@ def aggregates_of(scores: np.ndarray) -> np.ndarray:
 
 def resample(*matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> list[np.ndarray]:
     """
-    :param matrices: (runs, games, ...), of one agent each; drawn independently of each other
-    :param reps: bootstrap samples
-    :param seed: of NumPy's global generator, from which rliable draws whatever it is given; it is put back afterwards
+    :param matrices: (runs, games, ...), of one agent each; resampled independently of each other
+    :param reps: number of bootstrap samples
+    :param seed: seed for NumPy's global generator, which rliable always uses; its state is restored afterwards
     :return: (reps, runs, games, ...) each
     """
     kind = library.StratifiedBootstrap if len(matrices) == 1 else library.StratifiedIndependentBootstrap
@@ -54,10 +54,10 @@ def resample(*matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> list[np.
 
 def estimate(function: Callable[..., np.ndarray], *matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """
-    :param function: of arrays (..., runs, games), to (...) or (..., n)
+    :param function: maps arrays (..., runs, games) to (...) or (..., n)
     :param matrices: (runs, games, ...), of one agent each
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap
+    :param reps: number of bootstrap samples
+    :param seed: seed of the bootstrap
     """
     value = function(*matrices)
     if min(map(len, matrices)) < 2:
@@ -71,7 +71,7 @@ def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
     """
     :param scores: columns agent, game, seed, score; the scores normalised
     :return: agent -> (runs, games), games in alphabetical order
-    :raises ValueError: if an agent has not the same number of runs on every game
+    :raises ValueError: if an agent's number of runs differs between games
     """
     games = sorted(scores["game"].unique())
     matrices = {}
@@ -79,7 +79,7 @@ def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
         runs = rows.groupby("game")["seed"].nunique().reindex(games, fill_value=0)
         if runs.nunique() != 1:
             counts = ", ".join(f"{game}: {count}" for game, count in runs.items())
-            raise ValueError(f"{agent}: expected the same number of runs on every game, found {counts}")
+            raise ValueError(f"{agent} must have the same number of runs on every game, got {counts}.")
         columns = [rows[rows["game"] == game].sort_values("seed")["score"].to_numpy() for game in games]
         matrices[str(agent)] = np.stack(columns, axis=1)
     return matrices
@@ -104,7 +104,7 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
 
     :param matrix: (runs, games), normalised scores
     :param thresholds: (n,), in the unit of the scores
-    :return: (n,) each, of pointwise intervals
+    :return: (n,) each, with pointwise intervals
     """
 
     def fractions(scores: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
 
 
 def average_score_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
-    """As :func:`performance_profile`: the fraction of games whose mean over runs is above a threshold (Fig. 4 (b) of EqR)."""
+    """As :func:`performance_profile`, for the fraction of games whose mean over runs is above a threshold (Fig. 4 (b))."""
 
     def fractions(scores: np.ndarray) -> np.ndarray:
         return (scores.mean(axis=-2)[..., None] > thresholds).mean(axis=-2)
@@ -124,7 +124,7 @@ def average_score_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int 
 
 def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """
-    :param curves: (runs, games, points), normalised scores at evaluations along training
+    :param curves: (runs, games, points), normalised scores of the evaluations during training
     :return: IQM, low, high: (points,) each
     """
     return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps=reps, seed=seed)
@@ -132,10 +132,10 @@ def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Es
 
 def probability_of_improvement(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """
-    How likely a run of the first agent beats one of the second, averaged over games; ties count one half.
+    How likely a run of the first agent beats one of the second, averaged over games; ties count as one half.
 
     :param first: (..., runs, games)
-    :param second: as well; the number of runs may differ
+    :param second: (..., runs, games), where the number of runs may differ from the first's
     :return: (...), in [0, 1]
     """
     wins = [
@@ -150,7 +150,7 @@ def improvement_probabilities(
 ) -> pd.DataFrame:
     """
     :param matrices: agent -> (runs, games), normalised scores
-    :param baseline: the agent that the others are held against
+    :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, value, low, high; a row per agent other than the baseline
     """
     rows = [
@@ -165,14 +165,14 @@ def improvement_probabilities(
 
 def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS, seed: int = 0) -> float:
     """
-    How far apart the IQMs of two agents must lie for their runs to show it: half the width of the 95 % interval around a
-    difference of 0. Its variances are those that the bootstrap finds, times n / (n - 1), which a bootstrap of n runs is short
-    of, and its quantile is Student's, with games (n₁ + n₂ - 2) degrees of freedom: without these two, agents that are alike
-    would be distinguished by 2 runs on 3 games in a fifth of all cases.
+    The smallest difference between the IQMs of two agents that their runs can detect: half the width of the 95 % interval
+    around a difference of 0. It uses the bootstrap's variances times n / (n - 1), because a bootstrap of n runs
+    underestimates them by that factor, and Student's quantile with games (n₁ + n₂ - 2) degrees of freedom. Without both
+    corrections, 2 runs on 3 games would distinguish identical agents in a fifth of all cases.
 
     :param first: (runs, games), normalised scores
-    :param second: as well; the number of runs may differ
-    :return: in the unit of the scores; NaN with a single run of either, which says nothing of its spread
+    :param second: (runs, games), where the number of runs may differ from the first's
+    :return: the difference in the unit of the scores; NaN if either agent has a single run, whose spread is unknown
     """
     if min(len(first), len(second)) < 2:
         return np.nan
@@ -185,7 +185,7 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
 def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
     :param matrices: agent -> (runs, games), normalised scores
-    :param baseline: the agent that the others are held against
+    :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, runs, baseline_runs, games, difference (of the IQMs, agent - baseline), detectable
         (see :func:`detectable_difference`)
     """
@@ -208,7 +208,7 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
 def games_above(matrix: np.ndarray, bound: float = 1.0) -> int:
     """
     :param matrix: (runs, games), normalised scores
-    :param bound: 1 is human play where scores are human-normalised: the "superhuman games" of the EqR paper's tables
-    :return: on how many games the mean over runs is above the bound
+    :param bound: 1 is the human score where scores are human-normalised, for the "superhuman games" of the EqR paper's tables
+    :return: number of games whose mean over runs is above the bound
     """
     return int((matrix.mean(axis=0) > bound).sum())

@@ -18,20 +18,20 @@ OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
 
 
 class Strict(BaseModel):
-    """Keys and values exactly as written here: an unknown key is a mistake, and so is a flag where a number is needed."""
+    """A model that rejects unknown keys, and values of another type, such as a flag for a number."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
 class Curve(Strict):
-    """A learning curve has ``points`` points of ``episodes`` episodes each; the last one is the final evaluation."""
+    """The learning curve: ``points`` points of ``episodes`` episodes each; the last point is the final evaluation."""
 
     points: PositiveInt
     episodes: PositiveInt
 
 
 class Evaluation(Strict):
-    """How agents are evaluated: ``episodes`` in ``n_envs`` environments, of at most ``max_steps`` steps (``None``: any)."""
+    """The evaluation: ``episodes`` in ``n_envs`` environments, of at most ``max_steps`` steps (``None``: no limit)."""
 
     episodes: PositiveInt
     n_envs: PositiveInt
@@ -42,7 +42,7 @@ class Evaluation(Strict):
 
 
 class Normalisation(Strict):
-    """Which raw scores become 0 and 1, per game, and what they are."""
+    """The raw scores that become 0 and 1, per game, their unit and source."""
 
     unit: str
     source: str
@@ -53,19 +53,19 @@ class Normalisation(Strict):
     def _rise(cls, scores: dict[str, list[float]]) -> dict[str, list[float]]:
         for game, (low, high) in scores.items():
             if low >= high:
-                raise ValueError(f"{game}: the score that becomes 1 must be above the one that becomes 0")
+                raise ValueError(f"{game}: the score that becomes 1 must be above the one that becomes 0, got {low}, {high}.")
         return scores
 
 
 class Suite(Strict):
     """
-    :param name: of the suite
-    :param games: names as users write them
-    :param env_id: gymnasium's name of a game's environment, "{game}" standing for the game
-    :param steps: training steps of the agent, per game; in a file also one number for all
-    :param preprocessing: keys of RL Zoo's entries (``env_wrapper``, ``frame_stack``, ...) that stand before an agent's own
-    :param evaluation: its preprocessing is that of training where it has none
-    :param normalisation: "human" in a file: random play 0, a human tester 1; raw scores where there is none
+    :param name: name of the suite
+    :param games: names of the games, as given by the user
+    :param env_id: gymnasium's name of a game's environment, with "{game}" in place of the game
+    :param steps: training steps of the agent, per game; in a file also one number for all games
+    :param preprocessing: keys of RL Zoo's entries (``env_wrapper``, ``frame_stack``, ...) that override an agent's own
+    :param evaluation: the evaluation; its preprocessing defaults to that of training
+    :param normalisation: in a file, "human" means random play 0, a human tester 1; the default is raw scores
     """
 
     name: str
@@ -79,9 +79,9 @@ class Suite(Strict):
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, entry: Any) -> Any:
-        """What a file may leave out."""
+        """Fill in what a file may leave out."""
         if not isinstance(entry, dict) or not isinstance(entry.get("games"), list):
-            return entry  # pydantic says what is wrong
+            return entry  # pydantic reports what is wrong
         games = [game for game in entry["games"] if isinstance(game, str)]
         found = {"normalisation": {"unit": "raw score", "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
         if found["normalisation"] == "human":
@@ -95,15 +95,15 @@ class Suite(Strict):
     @model_validator(mode="after")
     def _covers_games(self) -> "Suite":
         if "{game}" not in self.env_id and len(self.games) > 1:
-            raise ValueError(f"env_id: expected {{game}} in it, found {self.env_id!r}")
+            raise ValueError(f"env_id must contain {{game}}, got {self.env_id!r}.")
         for what, there in (("steps", self.steps), ("normalisation: scores", self.normalisation.scores)):
             if missing := [game for game in self.games if game not in there]:
-                raise ValueError(f"{what}: expected them for every game, found none for {', '.join(missing)}")
+                raise ValueError(f"{what} must have every game, got none for {', '.join(missing)}.")
         return self
 
     def protocol(self, game: str) -> dict[str, Any]:
         """
-        :return: what must be the same for two scores to stand in one table
+        :return: the settings that two scores must share to be comparable
         """
         return {
             "env_id": self.env_id.format(game=game),
@@ -115,10 +115,10 @@ class Suite(Strict):
 
 def nearest_name(name: str, legal: Iterable[str]) -> str:
     """
-    :return: the end of a message: the nearest legal name and all of them
+    :return: the end of a message, with the nearest legal name and all legal names
     """
     names = sorted(legal)
-    return f"{nearest(name, names)} There are {', '.join(names)}."
+    return f"{nearest(name, names)} Choose from {', '.join(names)}."
 
 
 def human_scores(games: list[str]) -> dict[str, Any]:
@@ -133,14 +133,14 @@ def human_scores(games: list[str]) -> dict[str, Any]:
 
 def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     """
-    :param name: of the suite
-    :param where: the file, for messages
-    :param entry: as in suites.yml
-    :raises ValueError: for an entry that is not complete, with what is wrong
+    :param name: name of the suite
+    :param where: name of the file, for messages
+    :param entry: an entry as in suites.yml
+    :raises ValueError: for an invalid or incomplete entry
     """
     where = f"{where}, suite {name!r}"
     if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected keys and values, found {entry!r}")
+        raise ValueError(f"{where} must be a mapping, got {entry!r}. See docs/benchmark.md.")
     try:
         return Suite.model_validate({"name": name} | entry)
     except ValidationError as error:
@@ -148,7 +148,7 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
 
 
 def _first_mistake(error: ValidationError) -> str:
-    """In words: where it is, what was expected, what was found."""
+    """:return: the first mistake in words: the key, what it must be, and its value"""
     mistake = error.errors(include_url=False)[0]
     *outer, key = mistake["loc"] or ("",)
     path = ": ".join(map(str, mistake["loc"]))
@@ -157,17 +157,17 @@ def _first_mistake(error: ValidationError) -> str:
         kind = kinds.get(str(outer[-1]), Suite) if outer else Suite
         return f"unknown key {path!r}.{nearest_name(str(key), kind.model_fields)}"
     if mistake["type"] == "missing":
-        return f"expected the key {path!r}, found none"
+        return f"{path} must be set, got nothing."
     if mistake["type"] == "value_error":
         return f"{path}: {mistake['ctx']['error']}" if path else str(mistake["ctx"]["error"])
-    return f"{path}: {mistake['msg'][0].lower()}{mistake['msg'][1:]}, found {mistake['input']!r}"
+    return f"{path}: {mistake['msg'][0].lower()}{mistake['msg'][1:]}, got {mistake['input']!r}."
 
 
 def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     """
-    :param name: of a suite
-    :param file: one more file of suites; its names stand before ours
-    :raises ValueError: for a suite that there is not, with the nearest name, or one that is not complete
+    :param name: name of a suite
+    :param file: an additional file of suites, which override ours of the same name
+    :raises ValueError: for an unknown suite, with the nearest name, or an invalid one
     """
     entries = {key: (OWN_SUITES, entry) for key, entry in yaml.safe_load(OWN_SUITES.read_text(encoding="utf-8")).items()}
     if file is not None:
@@ -176,13 +176,13 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
         try:
             own = yaml.safe_load(file.read_text(encoding="utf-8"))
         except yaml.YAMLError as error:
-            raise ValueError(f"{file} is no YAML: {error}") from error
+            raise ValueError(f"--suite-file must be valid YAML, got {file}: {error}") from error
         if not isinstance(own, dict):
-            raise ValueError(f"{file}: expected suites by name, found {type(own).__name__}. See docs/benchmark.md.")
+            raise ValueError(f"{file} must be a mapping of suites by name, got {type(own).__name__}. See docs/benchmark.md.")
         entries |= {key: (file, entry) for key, entry in own.items()}
     if name not in entries:
         raise ValueError(
-            f"--suite: there is no suite {name!r}.{nearest_name(name, entries)} A file with your own: --suite-file FILE."
+            f"--suite: there is no suite {name!r}.{nearest_name(name, entries)} --suite-file FILE adds suites of your own."
         )
     path, entry = entries[name]
     return make_suite(name, path.name, entry)
@@ -191,9 +191,9 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
 def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
     """
     :param suite: the suite
-    :param games: those to keep, in any case; ``None``: all
-    :param steps: instead of the suite's own
-    :raises ValueError: for a game that the suite has not, with the nearest name, or that gymnasium has not
+    :param games: the games to keep, ignoring case; ``None``: all
+    :param steps: training steps that override the suite's
+    :raises ValueError: for a game that the suite or gymnasium does not have, with the nearest name
     """
     envs.register()
     kept = suite.games
@@ -214,13 +214,13 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:
-    """Write a suite whole, with everything that it leaves to its defaults."""
+    """Write a suite in full, including defaults."""
     with atomic_write(path, "yml") as file:
         file.write(yaml.safe_dump(suite.model_dump(), sort_keys=False).encode())
 
 
 def read_suite(path: pathlib.Path) -> Suite:
     """
-    :param path: of :func:`write_suite`
+    :param path: a file written by :func:`write_suite`
     """
     return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))

@@ -1,4 +1,4 @@
-"""Tables of a report: texts in a pandas frame, whose first column names the rows, and which of them are bold."""
+"""Tables of a report: strings in a pandas frame, whose first column names the rows, and a mask of those in bold."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -11,27 +11,27 @@ from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM
 from sb3_eqr.benchmark.statistics import METRICS, detectable_difference, games_above, iqm
 
-LATEX = {"±": r"$\pm$", "−": "$-$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}"}  # what pandas leaves as it is
+LATEX = {"±": r"$\pm$", "−": "$-$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}"}  # pandas does not escape these
 
 
 class Table(NamedTuple):
     """
-    :param cells: texts; what follows a line break is an addition, a spread or an interval
-    :param bold: as large
+    :param cells: strings; a second line is a spread or an interval
+    :param bold: mask of the cells in bold, of the same shape
     """
 
     cells: pd.DataFrame
     bold: pd.DataFrame
 
     def emphasised(self, before: str, after: str) -> pd.DataFrame:
-        """:return: the cells, with something around the first line of those that are bold"""
+        """:return: the cells, with ``before`` and ``after`` around the first line of bold ones"""
         return self.cells.mask(self.bold, self.cells.replace(r"^([^\n]+)", rf"{before}\1{after}", regex=True))
 
 
 def make_table(header: Sequence[str], rows: Sequence[Sequence[str]], bold: Sequence[Sequence[bool]] | None = None) -> Table:
     """
-    :param rows: as long as the header
-    :param bold: as many; none of them where not given
+    :param rows: rows as long as the header
+    :param bold: mask of the cells in bold; default: none
     """
     cells = pd.DataFrame(rows, columns=list(header), dtype=str)
     is_bold = np.zeros(cells.shape, dtype=bool) if bold is None else np.array(bold, dtype=bool).reshape(cells.shape)
@@ -40,8 +40,8 @@ def make_table(header: Sequence[str], rows: Sequence[Sequence[str]], bold: Seque
 
 def to_html(table: Table, kind: str = "numbers") -> str:
     """
-    :param kind: "numbers" or "words": how the columns are aligned
-    :return: a table in a box of its own that scrolls sideways
+    :param kind: "numbers" or "words", for the alignment of the columns
+    :return: a table in a box that scrolls horizontally
     """
     escaped = Table(table.cells.map(html.escape).rename(columns=html.escape), table.bold.rename(columns=html.escape))
     cells = escaped.emphasised("<b>", "</b>").replace(r"\n(.*)", r"<br><small>\1</small>", regex=True)
@@ -50,14 +50,14 @@ def to_html(table: Table, kind: str = "numbers") -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """:return: a table of GitHub's Markdown"""
+    """:return: a table in GitHub's Markdown"""
     cells = table.emphasised("**", "**").replace(r"\n", " ", regex=True).replace(r"\|", r"\\|", regex=True)
     align = ("left", *["right"] * (len(cells.columns) - 1))
     return cells.to_markdown(index=False, disable_numparse=True, colalign=align) + "\n"
 
 
 def to_latex(table: Table) -> str:
-    """:return: a ``tabular`` with the rules of the package booktabs"""
+    """:return: a ``tabular`` with rules of the package booktabs"""
     cells = table.cells.replace(r"\n", " ", regex=True)
     style = cells.style.format(escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
     style = style.apply(lambda _: table.bold.replace({True: "font-weight: bold", False: ""}), axis=None)
@@ -70,8 +70,8 @@ def to_latex(table: Table) -> str:
 def number(value: float, decimals: int | None = None) -> str:
     """
     :param value: a score
-    :param decimals: as many as its size asks for if ``None``: about three significant digits
-    :return: with thousands separated and a true minus sign, "–" for NaN
+    :param decimals: number of decimals; ``None``: see :func:`decimals_of`
+    :return: the number with thousands separators and a true minus sign, "–" for NaN
     """
     if np.isnan(value):
         return "–"
@@ -80,7 +80,7 @@ def number(value: float, decimals: int | None = None) -> str:
 
 
 def decimals_of(value: float) -> int:
-    """:return: decimals that give about three significant digits: 0 from 100 on, 1 from 10 on, 2 below"""
+    """:return: decimals for about three significant digits: 0 from 100, 1 from 10, 2 below"""
     return 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
 
 
@@ -92,8 +92,8 @@ def with_interval(value: float, low: float, high: float) -> str:
 def distinct_best(matrices: Mapping[str, np.ndarray], differing: Mapping[str, str], reps: int) -> list[bool]:
     """
     :param matrices: agent -> (runs, games), normalised scores
-    :param differing: agents that do not count: their protocol is another one
-    :return: of each agent whether it is the best, and these runs distinguish it from all others
+    :param differing: agents to leave out, because their protocol differs
+    :return: for each agent, whether it is the best and these runs distinguish it from all others
     """
     values = {agent: float(iqm(matrix)) for agent, matrix in matrices.items() if agent not in differing}
     best = max(values, key=lambda agent: values[agent], default="")
@@ -107,7 +107,7 @@ def distinct_best(matrices: Mapping[str, np.ndarray], differing: Mapping[str, st
 
 def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
     """
-    Aggregates of methods of which only the means of games are known: those of a single run with these scores.
+    Aggregates of methods with known game means only, computed as for a single run with these scores.
 
     :param means: rows games, columns methods, raw
     :return: columns label, metric, value; the metrics of ``METRICS`` and "above 1"
@@ -126,7 +126,7 @@ def aggregate_rows(
     """
     :param aggregates: columns agent, metric, value, low, high
     :param matrices: agent -> (runs, games), normalised scores
-    :return: name of the row -> a text per agent
+    :return: name of the row -> a string per agent
     """
     by_agent = aggregates.set_index(["agent", "metric"])
     rows = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in METRICS}
@@ -136,7 +136,7 @@ def aggregate_rows(
 
 
 def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], reps: int) -> Table:
-    """The aggregates of the runs compared, a row per agent; parameters as those of :func:`aggregate_rows`."""
+    """The aggregates of the runs compared, a row per agent; for the parameters see :func:`aggregate_rows`."""
     columns = aggregate_rows(comparison, aggregates, matrices)
     rows = [
         [comparison.label(agent), str(len(matrix)), *(texts[place] for texts in columns.values())]
@@ -155,16 +155,16 @@ def game_table(
     reps: int,
 ) -> Table:
     """
-    Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised ones below.
+    A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below.
 
-    :param means: of :func:`~sb3_eqr.benchmark.analysis.published`; the others are those of :func:`aggregate_rows`
+    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`; for the other parameters see :func:`aggregate_rows`
     """
     names = (RANDOM, HUMAN) if comparison.human else ("score 0", "score 1")
     header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
     by_game = comparison.scores.groupby(["agent", "game"])["raw"].agg(["mean", "std"])
     rows, bold = [], []
     for game in comparison.games:
-        place = sorted(comparison.games).index(game)  # of its column
+        place = sorted(comparison.games).index(game)  # the game's column
         found = [by_game.loc[(agent, game)] for agent in matrices]
         texts = [
             number(mean) + ("" if np.isnan(spread) else f"\n± {number(spread, decimals_of(mean))}") for mean, spread in found

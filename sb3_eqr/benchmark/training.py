@@ -1,4 +1,4 @@
-"""Doing one run of a benchmark, from its beginning or last checkpoint to its scores, and what it measures on the way."""
+"""Execute one run of a benchmark, from its start or last checkpoint to its scores, and record measurements."""
 
 import argparse
 import contextlib
@@ -32,7 +32,7 @@ from sb3_eqr.common.plain_data import decode
 from sb3_eqr.common.resets import Resets
 from sb3_eqr.zoo import register
 
-PROGRESS_SECONDS = 2.0  # between two notes of where a run is
+PROGRESS_SECONDS = 2.0  # between writes of a run's progress
 PACKAGES = (
     "sb3-eqr",
     "stable-baselines3",
@@ -48,7 +48,7 @@ PACKAGES = (
 
 
 def new_record() -> dict[str, Any]:
-    """What a run measures: "seconds" of everything, and "training_seconds" without evaluations and checkpoints."""
+    """:return: an empty record of a run; "seconds" is total time, "training_seconds" excludes evaluations and checkpoints"""
     return {
         "seconds": 0.0,
         "training_seconds": 0.0,
@@ -62,14 +62,16 @@ def new_record() -> dict[str, Any]:
 
 class LossWriter(KVWriter):
     """
-    :param losses: a row is appended whenever SB3 dumps its log
+    Collects the losses that SB3 logs.
+
+    :param losses: a row is appended at each dump of the log
     """
 
     def __init__(self, losses: list[dict[str, float]]):
         self._losses = losses
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """As SB3's writers."""
+        """Append the logged losses; the interface of SB3's writers."""
         row = {key[6:]: float(v) for key, v in key_values.items() if key.startswith("train/") and key.endswith("loss")}
         if row:
             self._losses.append({"step": step, **row})
@@ -77,9 +79,9 @@ class LossWriter(KVWriter):
 
 class Clock:
     """
-    Adds the time since the last reading to what a record has.
+    Adds elapsed time to a record.
 
-    :param record: of :func:`new_record`
+    :param record: see :func:`new_record`
     """
 
     def __init__(self, record: dict[str, Any]):
@@ -88,6 +90,8 @@ class Clock:
 
     def read(self, what: str) -> None:
         """
+        Add the time since the last reading.
+
         :param what: what the time was spent on: "training_seconds", or "seconds" for anything else
         """
         now = time.monotonic()
@@ -98,10 +102,10 @@ class Clock:
 
 class RunCallback(BaseCallback):
     """
-    Notes training scores and progress, evaluates along the way, writes checkpoints, stops after exactly the steps asked for.
+    Records training scores and progress, evaluates, writes checkpoints, and stops after exactly the requested steps.
 
     :param run: the run
-    :param record: what was measured so far
+    :param record: the measurements so far
     :param settings: the settings
     """
 
@@ -148,15 +152,15 @@ class RunCallback(BaseCallback):
 
     def is_due(self) -> bool:
         """
-        :return: whether a point of the learning curve has come since the last evaluation
+        :return: whether a point of the learning curve has been reached since the last evaluation
         """
         last = max((row["step"] for row in self.record["evaluations"]), default=0)
         return any(last < step <= self.num_timesteps < self.steps for step in self.due)
 
     def has_settled(self) -> bool:
         """
-        :return: whether half of the updates from one reset of the network to the next are done; a network that has just been
-            reset plays like a new one
+        :return: whether half of the updates between two resets of the network are done; right after a reset, the agent
+            performs like an untrained one
         """
         resets: Resets | None = getattr(self.model, "_resets", None)
         if resets is None or resets.schedule.interval is None or not resets.done:
@@ -164,7 +168,7 @@ class RunCallback(BaseCallback):
         return 2 * resets.updates_since(self.model._n_updates) >= resets.schedule.interval  # type: ignore[attr-defined]
 
     def note_progress(self) -> None:
-        """Write where the run is, for the table."""
+        """Write the run's progress, for the table."""
         seconds = self.record["training_seconds"] - self.first_second
         rate = (self.num_timesteps - self.first_step) / seconds if seconds > 0 else 0.0
         progress = {"step": self.num_timesteps, "steps": self.steps, "steps_per_second": rate, "host": platform.node()}
@@ -174,6 +178,8 @@ class RunCallback(BaseCallback):
 
 def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind: str, n_episodes: int) -> None:
     """
+    Evaluate the agent and add the scores to the record.
+
     :param kind: "curve" or "final"
     """
     scores, lengths = evaluate(model, run.protocol, n_episodes, run.seed)
@@ -182,9 +188,9 @@ def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind:
 
 def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
     """
-    The agent as RL Zoo builds it, on environments that write no files.
+    Build the agent as RL Zoo does, on environments that write no files.
 
-    :return: the agent, the callbacks of its entry
+    :return: the agent and the callbacks of its entry
     """
     with tempfile.TemporaryDirectory() as logs, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
         config = pathlib.Path(logs) / "entry.yml"
@@ -213,14 +219,14 @@ def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
 
 def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[BaseAlgorithm, dict[str, Any], bool]:
     """
-    As an EqR agent's ``resume``, for every agent of Stable-Baselines3.
+    Like an EqR agent's ``resume``, for all agents of Stable-Baselines3.
 
-    :param checkpoint: of :func:`~sb3_eqr.common.checkpoints.write_checkpoint`
-    :param model: newly built, whose class, device and environment are used
-    :return: the agent that continues, what was measured so far, and whether it does so bit for bit; if not, with a new episode
+    :param checkpoint: see :func:`~sb3_eqr.common.checkpoints.write_checkpoint`
+    :param model: a new agent, whose class, device and environment are used
+    :return: the resumed agent, the measurements so far, and whether it resumes bit for bit; if not, with a new episode
     """
     checkpoint, manifest = checkpoints.read_manifest(checkpoint)
-    is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # which SB3 does not save
+    is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # SB3 does not save these
     env = model.get_env()
     assert env is not None
     model = type(model).load(checkpoint / checkpoints.MODEL, env=env, device=model.device, force_reset=not is_exact)
@@ -233,20 +239,20 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     assert env is not None
     checkpoints.restore_environment(env, checkpoint, wrappers_only=not is_exact)
     if not is_exact:
-        env.seed((model.seed or 0) + model.num_timesteps)  # other episodes than at the start
+        env.seed((model.seed or 0) + model.num_timesteps)  # not the episodes from the start again
     checkpoints.restore_generators(model, manifest)
     return model, decode(manifest["notes"]), is_exact
 
 
 def remove_checkpoints(folder: pathlib.Path) -> None:
-    """Those of a finished run, and what a killed one has left of them."""
+    """Remove the checkpoints of a finished run, and partial ones that a killed run left."""
     for checkpoint in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*")]:
         shutil.rmtree(checkpoint, ignore_errors=True)
 
 
 def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
     """
-    :return: what was run and on what
+    :return: what was run, with versions and machine
     """
     versions = {}
     for package in PACKAGES:
@@ -262,7 +268,7 @@ def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, 
 
 
 def train(run: Run, settings: Settings) -> None:
-    """Train, evaluate, write ``result.json``; what was begun before resumes from its last checkpoint."""
+    """Train, evaluate, write ``result.json``; an interrupted run resumes from its last checkpoint."""
     started = time.monotonic()
     envs.register()
     register()
@@ -299,16 +305,16 @@ def train(run: Run, settings: Settings) -> None:
 
 def execute(run: Run, settings: Settings) -> str:
     """
-    A run from wherever it is to its end, by one process at a time.
+    Start or resume a run and finish it. Only one process at a time can hold a run.
 
-    :return: "finished", or "busy" if another process has it
-    :raises Exception: what stopped it; the traceback is in ``error.txt``, the last checkpoint is whole
+    :return: "finished", or "busy" if another process holds the run
+    :raises Exception: whatever stopped the run; the traceback is in ``error.txt``, and the last checkpoint is complete
     """
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(run.folder / LOCK, blocking=False):
             if (run.folder / RESULT).is_file():
-                remove_checkpoints(run.folder)  # of a process that was killed at the very end
+                remove_checkpoints(run.folder)  # left by a process that was killed after writing the result
                 return "finished"
             th.set_num_threads(settings.n_threads)
             try:
@@ -316,8 +322,8 @@ def execute(run: Run, settings: Settings) -> str:
             except (Exception, SystemExit) as error:
                 with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
                     file.write(traceback.format_exc().encode())
-                if isinstance(error, SystemExit):  # would end Ray's worker, too
-                    raise RuntimeError(f"{run.agent.file}: cannot be used (exit {error.code})") from error
+                if isinstance(error, SystemExit):  # would also end Ray's worker
+                    raise RuntimeError(f"{run.agent.file} cannot be used (exit {error.code})") from error
                 raise
             for name in (ERROR, PROGRESS, STARTS):
                 (run.folder / name).unlink(missing_ok=True)

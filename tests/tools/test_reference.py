@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.published_rows import disagreements, last_rows, published_table
-from benchmarks.published_rows import human_normalized
+from benchmarks.published_rows import disagreements, human_normalized, last_rows, published_table
 from sb3_eqr.benchmark.reference import load_reference, match_games
 from sb3_eqr.benchmark.scores import read_runs
 from tests.tools.test_package import ROOT
@@ -86,7 +85,7 @@ def test_games_match_in_any_spelling():
         "PONG": "Pong",
         "Up n Down": "UpNDown",
     }
-    with pytest.raises(ValueError, match="expected each game once, found 'pong' beside another spelling"):
+    with pytest.raises(ValueError, match="Each game must be given once, got 'pong' in two spellings"):
         match_games(["Pong", "pong"], ["Pong"])
 
 
@@ -105,14 +104,14 @@ def test_runs_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "reference X, .*x.json: expected .*, found Invalid JSON"),
-        ("[1]", "with a raw score per run, found Input should be an object. Write its runs as lists of finite numbers"),
-        ('{"Pong": 3}', "found Pong: Input should be a valid (list|array)"),
-        ('{"Pong": [1, NaN]}', "found Pong: 1: Input should be a finite number"),
-        ('{"Pong": [true]}', "found Pong: 0: Input should be a valid number"),
-        ('{"Pong": []}', "found Pong: List should have at least 1 item"),
-        ('{"Pong": [1]}', "expected scores for Pong, BankHeist, found none for BankHeist. Add them"),
-        ('{"Pong": [1], "BankHeis": [1]}', r"found 'BankHeis'. Did you mean 'BankHeist'\? Correct the name"),
+        ("{", "--reference X: .*x.json must contain .*, got Invalid JSON"),
+        ("[1]", "with a raw score per run, got Input should be an object. Write its runs as lists of finite numbers"),
+        ('{"Pong": 3}', "got Pong: Input should be a valid (list|array)"),
+        ('{"Pong": [1, NaN]}', "got Pong: 1: Input should be a finite number"),
+        ('{"Pong": [true]}', "got Pong: 0: Input should be a valid number"),
+        ('{"Pong": []}', "got Pong: List should have at least 1 item"),
+        ('{"Pong": [1]}', "must contain scores for Pong, BankHeist, got none for BankHeist. Add them"),
+        ('{"Pong": [1], "BankHeis": [1]}', r"got 'BankHeis'. Did you mean 'BankHeist'\? Correct the name"),
     ],
 )
 def test_files_of_runs_that_are_wrong(tmp_path, content, message):
@@ -120,5 +119,5 @@ def test_files_of_runs_that_are_wrong(tmp_path, content, message):
     file.write_text(content)
     with pytest.raises(ValueError, match=message):
         read_runs(file, "X", ["Pong", "BankHeist"])
-    with pytest.raises(ValueError, match="expected .*, found no file to read: .*nowhere"):
+    with pytest.raises(ValueError, match=r"must contain .*, got no readable file: .*nowhere"):
         read_runs(tmp_path / "nowhere", "X", ["Pong"])

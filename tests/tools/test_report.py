@@ -254,7 +254,7 @@ def with_steps(agent, steps):
 
 def test_another_protocol_is_refused_or_marked(tmp_path, not_drawn):
     folder = a_benchmark(tmp_path / "a", change=with_steps(BASE, 50_000))
-    text = f"found {BASE}: steps is 50000, not 100000 (Pong, Boxing, Krull). Choose with --agents, or pass --force"
+    text = f"got {BASE}: steps is 50000, not 100000 (Pong, Boxing, Krull). Select agents with --agents, or pass --force"
     with pytest.raises(ValueError, match=re.escape(text)):
         write_report([folder], {}, False, tmp_path / "report")
     assert not (tmp_path / "report").exists()
@@ -276,14 +276,14 @@ def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
     suite = a_suite(games=[*SUITE.games, "Hero"])
     folder = a_benchmark(tmp_path / "a", suite=suite, change=change)
     with pytest.raises(
-        ValueError, match=r"found some missing. No finished run of any agent: Hero. dqn has no finished run on K"
+        ValueError, match=r"got some missing. No finished run of any agent: Hero. dqn has no finished run on K"
     ):
         write_report([folder], {}, False, tmp_path / "report")
     page = write_report([folder], {}, True, tmp_path / "report", reps=5)
     text = text_of(page)
     assert "No finished run of any agent: Hero." in text and "dqn has no finished run on Krull." in text
-    assert "Compared are the 2 of 4 games that every agent has: Pong, Boxing." in text
-    assert f"{FULL} has not all seeds on every game: Pong lacks 1. Compared are its seeds 0, 2" in text
+    assert "Only the 2 of 4 games that every agent has are compared: Pong, Boxing." in text
+    assert f"{FULL} lacks seeds on some games: Pong lacks 1. Only its seeds 0, 2, which" in text
     rows = pd.read_csv(page.with_name("aggregates.csv")).set_index(["agent", "metric"])
     kept = matrix(FULL)[[0, 2], :2]
     assert rows.at[(FULL, "mean"), "value"] == pytest.approx(kept.mean()) and rows.at[(FULL, "mean"), "runs"] == 2
@@ -292,35 +292,35 @@ def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
 
 def test_nothing_to_compare(tmp_path):
     apart = {"dqn": {"Pong": [1.0]}, "qrdqn": {"Krull": [1.0]}}
-    with pytest.raises(ValueError, match=r"found none: dqn has Pong; qrdqn has Krull. Choose some with --agents"):
+    with pytest.raises(ValueError, match=r"got none: dqn has Pong; qrdqn has Krull. Select agents with --agents"):
         compare([a_benchmark(tmp_path / "a", apart)], {}, False)
 
     def change(result):
         return result if (result["game"] == "Pong") == (result["seed"] == 0) else None
 
-    with pytest.raises(ValueError, match="dqn: expected a seed that it has on every game, found none: Pong: 0; Boxing: 1, 2"):
+    with pytest.raises(ValueError, match="dqn must have a seed finished on every game, got none: Pong: 0; Boxing: 1, 2"):
         compare([a_benchmark(tmp_path / "b", {"dqn": SCORES["dqn"]}, change=change)], {}, False)
-    with pytest.raises(ValueError, match=r"c: expected finished runs, found none. Run sb3-eqr benchmark run first"):
+    with pytest.raises(ValueError, match=r"c must contain finished runs, got none. Run sb3-eqr benchmark run first"):
         compare([a_benchmark(tmp_path / "c", {})], {}, False)
-    with pytest.raises(ValueError, match=r"nowhere: expected a folder of sb3-eqr benchmark run, with suite.yml in it"):
+    with pytest.raises(ValueError, match=r"nowhere must be a folder of sb3-eqr benchmark run, got one without suite.yml"):
         compare([tmp_path / "nowhere"], {}, False)
-    with pytest.raises(ValueError, match="expected one benchmark folder or more"):
+    with pytest.raises(ValueError, match="folders must be at least one benchmark folder, got none"):
         compare([], {}, False)
 
 
 def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
-    with pytest.raises(ValueError, match=r"Boxng: expected a game .* \(Pong, Boxing, Krull\).* Did you mean 'Boxing'\?"):
+    with pytest.raises(
+        ValueError, match=r"Boxng has no bounds for normalisation .* Pong, Boxing, Krull\. Did you mean 'Boxing'\?"
+    ):
         compare([a_benchmark(tmp_path / "a", {"dqn": {"Pong": [1.0]}}, change=lambda r: r | {"game": "Boxng"})], {}, False)
 
     one = {"dqn": {"Pong": [1.0]}}
     folders = [a_benchmark(tmp_path / "b", one), a_benchmark(tmp_path / "c", one)]
-    with pytest.raises(ValueError, match=r"dqn, Pong, seed 0: expected each run once, found it in .*b and .*c"):
+    with pytest.raises(ValueError, match=r"dqn, Pong, seed 0 must be in one folder, got it in .*b and .*c"):
         compare(folders, {}, False)
     other = normalised(Pong=[0.0, 1.0])
     later = a_benchmark(tmp_path / "d", {"qrdqn": {"Pong": [1.0]}}, suite=other)
-    with pytest.raises(
-        ValueError, match=r"normalisation of Pong: expected two bounds, the same in all folders, found 0.0 and 1"
-    ):
+    with pytest.raises(ValueError, match=r"The bounds of Pong must be the same in all folders, got 0.0 and 1"):
         compare([folders[0], later], {}, False)
 
 
@@ -328,9 +328,9 @@ def test_agents_and_baseline_are_chosen(tmp_path):
     folder = a_benchmark(tmp_path / "a")
     assert compare([folder], {}, False, baseline=FULL).agents == [FULL, "dqn", BASE]
     assert compare([folder], {}, False, [BASE], FULL).agents == [FULL, BASE]
-    with pytest.raises(ValueError, match=r"--agents: 'ppo' has no finished run.* There are dqn, eqr_rainbow:se2"):
+    with pytest.raises(ValueError, match=r"--agents: 'ppo' has no finished run.* Choose from dqn, eqr_rainbow:se2"):
         compare([folder], {}, False, ["ppo"])
-    with pytest.raises(ValueError, match=r"--baseline: expected one of dqn, eqr.*, found 'ppo'"):
+    with pytest.raises(ValueError, match=r"--baseline must be one of dqn, eqr.*, got 'ppo'"):
         compare([folder], {}, False, baseline="ppo")
 
 
@@ -340,7 +340,7 @@ def test_published_scores_stand_beside_runs_of_their_steps_only(tmp_path, not_dr
         return result
 
     text = text_of(write_report([a_benchmark(tmp_path / "a", change=change)], {}, False, tmp_path / "report", reps=5))
-    assert "Published scores are of 100,000 training steps, these are not" in text
+    assert "Published scores are for 100,000 training steps, these runs are not" in text
     assert "†" not in text and "superhuman games" in text
 
 
@@ -351,7 +351,7 @@ def test_runs_of_other_hyperparameters_are_told(tmp_path):
         return result
 
     assert compare([a_benchmark(tmp_path / "a", change=change)], {}, False).notes == [
-        f"{BASE}: its runs do not all have the same batch_size."
+        f"{BASE}: its runs differ in batch_size."
     ]
 
 
@@ -363,7 +363,7 @@ def test_agents_that_learn_nothing_are_told(tmp_path):
     scores = {agent: {"Pong": SCORES[agent]["Pong"]} for agent in ("dqn", FULL)}
     suite = a_suite(games=["Pong"])
     assert compare([a_benchmark(tmp_path / "a", scores, suite, change)], {}, False).notes == [
-        "dqn learns nothing on Pong (learning_starts 100,000 of 100,000 steps): it stays as it was made."
+        "dqn makes no update on Pong (learning_starts 100,000 of 100,000 steps): it stays untrained."
     ]
 
 
@@ -418,9 +418,9 @@ def test_a_reference_of_runs_joins_with_intervals(tmp_path, not_drawn):
     scores = matrix("T", {"T": {"Pong": [0.0, 1.0], "Boxing": [5.0, 6.0], "Krull": [2000, 2100]}})
     assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 2
     assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
-    assert "THEIRS: its first 2 runs, as many as Krull has" not in text_of(page)
+    assert "THEIRS: first 2 runs only, as many as Krull has" not in text_of(page)
     assert "THEIRS is better than dqn" in text_of(page) and "2 and 3 runs on 3 games" in text_of(page)
-    with pytest.raises(ValueError, match="reference dqn: expected a name that no agent has"):
+    with pytest.raises(ValueError, match="--reference must have a name that no agent has, got 'dqn'"):
         compare([tmp_path / "a"], {"dqn": file}, False)
 
 

@@ -58,7 +58,7 @@ def test_a_single_run_has_no_interval():
 
 
 def test_unequal_runs_are_told():
-    with pytest.raises(ValueError, match="a: expected the same number of runs on every game, found game0: 1, game1: 2"):
+    with pytest.raises(ValueError, match="a must have the same number of runs on every game, got game0: 1, game1: 2"):
         score_matrices(table("a", [[1.0, 2.0], [1.0, 2.0]]).query("game != 'game0' or seed == 0"))
 
 
