@@ -1,12 +1,12 @@
 """
-Seeing what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes numbers and pictures (docs/visualize.md), ``diagnose``
-gives the numbers, ``LatentCallback`` logs them in training, ``record`` films it. Needs ``pip install ".[visualize]"``
-in a clone of the repository.
+Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metrics and figures (docs/visualize.md),
+``diagnose`` computes the metrics, ``LatentCallback`` logs them during training, ``record`` writes an animation. Needs
+``pip install ".[visualize]"`` in a clone of the repository.
 
-``__main__`` reads the command, ``loading`` finds model and environment, with ``trust`` for files of others. ``latents`` plays
-and encodes, ``measures`` and ``findings`` compute, ``diagnostics`` has all of it and the verdict; ``tables`` and ``pictures``
-write it, with ``latent_figure`` for the states. A film: ``animation`` shoots it, ``pixels`` and ``sketches`` say what is to be
-seen, ``canvas`` draws it. ``callback`` does all this in training.
+``__main__`` parses the command line, ``loading`` loads model and environment, ``trust`` checks files from others. ``latents``
+runs the agent and encodes, ``measures`` and ``findings`` compute, ``diagnostics`` collects the metrics and the verdict;
+``tables`` and ``pictures`` write them, ``latent_figure`` plots the states. For the animation, ``animation`` collects the
+frames, ``pixels`` and ``sketches`` prepare what they show, ``canvas`` draws. ``callback`` is for use during training.
 """
 
 import importlib
@@ -23,7 +23,7 @@ _MODULES = {
 }
 
 
-def __getattr__(name: str) -> Any:  # later: the numbers need neither matplotlib nor imageio
+def __getattr__(name: str) -> Any:  # imported on use: the metrics need neither matplotlib nor imageio
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,4 +1,4 @@
-"""An agent at play, and beside it the blocks of its latent state as moving frames: now, and as predicted before."""
+"""An animation of the environment next to the blocks of the latent state, current and predicted."""
 
 import pathlib
 import random
@@ -26,20 +26,20 @@ from sb3_eqr.visualize.sketches import panels
 
 MAX_PANELS = 36
 MAX_LETTERS = 45  # of the group's name
-FPS = 15  # Atari's 60 frames a second, of which an agent sees every fourth
+FPS = 15  # Atari's 60 frames per second, of which an agent observes every fourth
 FORMATS = ("mp4", "gif")
-EVERY = {"mp4": 1, "gif": 2}  # every so many frames one is written
-OPTIONS: dict[str, dict[str, Any]] = {"mp4": {"quality": 8, "macro_block_size": 2}, "gif": {"loop": 0}}  # of imageio
+EVERY = {"mp4": 1, "gif": 2}  # write every n-th frame
+OPTIONS: dict[str, dict[str, Any]] = {"mp4": {"quality": 8, "macro_block_size": 2}, "gif": {"loop": 0}}  # for imageio
 
 
 class Film(NamedTuple):
     """T steps of one environment."""
 
-    observations: PyTorchObs  # (T, *obs_shape): s_t, as the network gets them
+    observations: PyTorchObs  # (T, *obs_shape): s_t, the network's input
     pictures: Sequence[np.ndarray]  # T of (height, width, 3), uint8
     actions: np.ndarray  # (T,), int64: a_t
     rewards: np.ndarray  # (T,): r_{t+1}, before normalisation
-    starts: np.ndarray  # (T,), int64: the step at which the episode of each began
+    starts: np.ndarray  # (T,), int64: the step at which each step's episode began
     action_names: list[str]  # one per action
 
 
@@ -55,27 +55,28 @@ def record(
     deterministic: bool = True,
 ) -> list[pathlib.Path]:
     """
-    A video of the agent playing: left the game, right one panel per block of its latent state. What turns is an arrow, what
-    shifts a dot with a trail; of a general matrix, the images of the unit vectors; in three dimensions, the three axes
-    (red, green, blue); without a group, the first two principal components. In orange, or pale, what the latent model
-    predicted for this moment ``depth`` steps before, from the state of then and the actions since; a triangle at an edge
-    where that lies beyond it. Above, the action that the agent chooses in this picture, its reward, and the score with it.
+    Write a video of the agent: the environment on the left, a panel per block of the latent state on the right. A rotation
+    is an arrow, a translation a dot with a trail, a general matrix the images of the unit vectors; in three dimensions, the
+    three axes (red, green, blue); without a group, the first two principal components. Orange or pale is what the latent
+    model predicted ``depth`` steps before, from the latent state then and the actions since; a triangle marks a prediction
+    beyond the edge. The line at the top has the action that the agent chooses in this frame, its reward, and the score
+    including it.
 
-    All random generators are left as they were; the same seed draws the same frames.
+    All random generators keep their states; the same seed gives the same frames.
 
-    :param model: any EqR agent; its latent model predicts only where it was trained (``prediction_depth`` > 0)
-    :param env: not the one in training, preprocessed as in training; a VecNormalize with ``training=False``. Of several
-        environments the first is filmed. With ``render_mode="rgb_array"`` its rendering is shown, else what the agent sees
-    :param path: without suffix (.mp4 and .gif are left out); every format adds its own. Folders are made, files written beside
-        and renamed
-    :param n_steps: of the environment, one frame each; more than ``depth``
+    :param model: any EqR agent; its latent model predicts only if it was trained (``prediction_depth`` > 0)
+    :param env: preprocessed as in training, but not the training environment itself; a VecNormalize with ``training=False``.
+        Of several environments the first is shown, with ``render_mode="rgb_array"`` its rendering, else the observations
+    :param path: path without suffix (.mp4 and .gif are removed); every format adds its own. Folders are created, and files
+        are written to a temporary name and renamed
+    :param n_steps: number of environment steps, one frame each; more than ``depth``
     :param depth: M ≥ 1
-    :param seed: of the environment and of the agent's noise
+    :param seed: seed of the environment and of the agent's noise
     :param formats: "mp4" (H.264) and "gif" (every second frame)
-    :param fps: frames per second; 15 where not given, which is Atari's own speed
+    :param fps: frames per second; default 15, which is Atari's real speed
     :param deterministic: whether the agent acts without noise
     :return: the files, in the order of ``formats``
-    :raises ValueError: for an argument out of its range, or an environment that is not the agent's
+    :raises ValueError: for an argument out of range, or an environment with other spaces than the agent's
     :raises ImportError: without the extra "visualize"
     """
     check_agent("record", model)
@@ -84,9 +85,9 @@ def record(
     path = pathlib.Path(path)
     path = path.with_suffix("") if path.suffix[1:].lower() in FORMATS else path  # x.mp4 would become x.mp4.mp4
     fps = FPS if fps is None else fps
-    check_number("fps", fps, 1, 50)  # what a GIF can do
+    check_number("fps", fps, 1, 50)  # the limit of GIF
     if not formats or set(formats) - set(FORMATS):
-        raise ValueError(f"formats: expected some of {list(FORMATS)}, found {formats!r}")
+        raise ValueError(f"formats must be one or more of {list(FORMATS)}, got {formats!r}.")
     with preserved_rng_state(model.action_space):
         film = shoot(model, env, n_steps, seed, deterministic)
     states = encode(model, film.observations)  # (T, D)
@@ -98,19 +99,19 @@ def record(
 
 def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deterministic: bool) -> Film:
     """
-    Let the agent play. Seeds the global generators.
+    Run the agent. Seeds the global generators.
 
     :param model: the agent
     :param env: see :func:`record`
     :param n_steps: T
-    :param seed: of the environment and of the agent's noise
+    :param seed: seed of the environment and of the agent's noise
     :param deterministic: whether the agent acts without noise
     """
     env = as_vec_env(model, env)
     for what in ("observation_space", "action_space"):
         if getattr(env, what) != getattr(model, what):
             raise ValueError(
-                f"env: expected the agent's {what} {getattr(model, what)}, found {getattr(env, what)}. "
+                f"env must have the agent's {what} {getattr(model, what)}, got {getattr(env, what)}. "
                 "Wrap the environment as in training."
             )
     normalize = unwrap_vec_normalize(env)
@@ -118,7 +119,7 @@ def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deter
     random.seed(seed)
     np.random.seed(seed)
     th.manual_seed(seed)
-    model.action_space.seed(seed)  # of ε-greedy actions
+    model.action_space.seed(seed)  # for ε-greedy actions
     env.seed(seed)
     obs: Any = env.reset()
     observations, pictures, actions, rewards, starts, start = [], [], [], [], [], 0
@@ -142,14 +143,14 @@ def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deter
 
 def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
     """
-    What the latent model predicted ``depth`` steps before.
+    The latent model's predictions from ``depth`` steps before.
 
     :param model: the agent
     :param states: x₀ of consecutive steps, (T, D)
     :param actions: a_t, (T,)
-    :param starts: the step at which the episode of each began, (T,)
+    :param starts: the step at which each step's episode began, (T,)
     :param depth: M
-    :return: x̂_M for each step, (T, D); NaN where the episode was not that old
+    :return: x̂_M for each step, (T, D); NaN in the first M steps of an episode
     """
     n = len(states) - depth
     latent_model = model.policy.latent_model
@@ -163,8 +164,8 @@ def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, sta
 
 def describe(model: EqRAlgorithm, n_shown: int) -> str:
     """
-    :param n_shown: how many panels there are
-    :return: what the agent is, in one line
+    :param n_shown: number of panels
+    :return: a description of the agent in one line
     """
     group, n_blocks = group_model(model).group, group_model(model).n_blocks
     blocks = "no group" if isinstance(group, NoGroup) else f"{group}" if n_blocks == 1 else f"{n_blocks} blocks of {group}"
@@ -175,7 +176,7 @@ def describe(model: EqRAlgorithm, n_shown: int) -> str:
 def frames(film: Film, painter: Painter) -> Iterator[np.ndarray]:
     """
     :param film: T steps
-    :param painter: of their latents
+    :param painter: painter with their latent states
     :return: T of (HEIGHT, WIDTH, 3), uint8
     """
     score = 0.0
@@ -188,14 +189,16 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
     """
     :param images: (HEIGHT, WIDTH, 3), uint8
     :param path: without suffix
-    :param formats: of :data:`FORMATS`
+    :param formats: some of :data:`FORMATS`
     :param fps: frames per second
     :return: the files
     """
     try:
         import imageio.v2 as imageio
     except ImportError as error:
-        raise ImportError('Videos need imageio, ffmpeg: pip install ".[visualize]" in a clone of the repository') from error
+        raise ImportError(
+            'Videos need imageio and ffmpeg. Run pip install ".[visualize]" in a clone of the repository.'
+        ) from error
     paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
     with tempfile.TemporaryDirectory() as folder:
         aside = {suffix: pathlib.Path(folder) / f"film.{suffix}" for suffix in formats}
@@ -218,7 +221,7 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
 def _first_envs(observations: list[Any]) -> Any:
     """
     :param observations: T of (n_envs, *obs_shape), or dicts of these
-    :return: (T, *obs_shape), of the first environment
+    :return: those of the first environment, (T, *obs_shape)
     """
     if isinstance(observations[0], dict):
         return {key: np.stack([obs[key][0] for obs in observations]) for key in observations[0]}

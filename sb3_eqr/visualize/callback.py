@@ -1,4 +1,4 @@
-"""The diagnostics of a latent model in TensorBoard, while it trains."""
+"""Log the diagnostics of a latent model to TensorBoard during training."""
 
 import warnings
 
@@ -14,28 +14,28 @@ from sb3_eqr.visualize.latents import check_agent, encode, replayed
 from sb3_eqr.visualize.measures import mean_of_known
 
 NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
-EXCLUDED = (*NO_PICTURES.values(), "log")  # the name of HumanOutputFormat's file
+EXCLUDED = (*NO_PICTURES.values(), "log")  # "log": HumanOutputFormat writing to a file
 
 
 class LatentCallback(BaseCallback):
     """
-    Callback for looking at the latent model of an EqR agent in training, on windows from its own replay buffer.
+    Callback for diagnosing the latent model of an EqR agent during training, on windows from its replay buffer.
 
-    It logs, under ``latent/``: ``skill`` and ``gain``, the share of the rollout's error that the model takes away from knowing
-    nothing and from standing still (as trained, all steps ahead together); ``effective_rank``, ``spread`` and
-    ``dead_units`` of the encoder; ``specificity`` and ``redundancy`` of the blocks, on average; ``symmetry_distance``, the
-    distance of the GET loss; ``reward_explained``; and a picture of the blocks, ``blocks``, coloured by their age. See
-    :func:`~sb3_eqr.visualize.diagnostics.diagnose`. What does not exist for an agent is not logged.
+    It logs, under ``latent/``: ``skill`` and ``gain``, the fractions by which the rollout's error is below that of shuffled
+    targets and of standing still (with the trained distance, over all steps ahead); ``effective_rank``, ``spread`` and
+    ``dead_units`` of the encoder; mean ``specificity`` and ``redundancy`` of the blocks; ``symmetry_distance``, the
+    distance of the GET loss; ``reward_explained``; and ``blocks``, a figure of the blocks, coloured by age. See
+    :func:`~sb3_eqr.visualize.diagnostics.diagnose`. Metrics that are undefined for an agent are not logged.
 
-    Training is the same, to the bit, with and without it: it has a random generator of its own, seeded by the agent's
-    seed and the step, and the networks look in eval mode.
+    Training is bit-identical with and without the callback: it has its own random generator, seeded with the agent's
+    seed and the step, and evaluates the networks in eval mode.
 
-    :param log_freq: Look whenever so many steps of the environments are over, all counted. The logger is dumped then, as
-        SB3's ``EvalCallback`` does
-    :param n_windows: How many windows to look at, drawn with replacement
-    :param pictures: Whether to draw, where the logger can take pictures (TensorBoard can)
-    :param verbose: Verbosity level: 0 for no output, 1 for a line whenever it has looked
-    :raises ValueError: for an argument out of its range; where training starts, if the agent is no EqR agent
+    :param log_freq: Log every ``log_freq`` steps, counted over all environments. This also dumps the logger, as SB3's
+        ``EvalCallback`` does
+    :param n_windows: Number of windows, drawn with replacement
+    :param pictures: Whether to log the figure, if the logger supports figures (TensorBoard does)
+    :param verbose: Verbosity level: 0 for no output, 1 for a line each time it logs
+    :raises ValueError: for an argument out of range, or, when training starts, if the agent is not an EqR agent
     """
 
     model: EqRAlgorithm
@@ -47,7 +47,7 @@ class LatentCallback(BaseCallback):
         self.log_freq = log_freq
         self.n_windows = n_windows
         self.pictures = pictures
-        self._looks = 0  # whole intervals that are over
+        self._looks = 0  # completed intervals
         self._has_warned = False
 
     def _init_callback(self) -> None:
@@ -66,11 +66,11 @@ class LatentCallback(BaseCallback):
     def _look(self) -> None:
         buffer = self.model.replay_buffer
         assert buffer is not None
-        if self.model.depth == 0:  # the buffer makes no rollouts, and nothing trains κ
+        if self.model.depth == 0:  # the buffer has no rollouts, and nothing trains κ
             if not self._has_warned:
                 warnings.warn(
-                    "LatentCallback: expected an agent whose latent model is trained, found prediction_depth=0 or all of "
-                    "aet_coef, symmetry_coef and reward_coef 0: there is nothing to look at. Leave the callback out."
+                    "LatentCallback logs nothing: the agent does not train its latent model, because prediction_depth is 0, "
+                    "or aet_coef, symmetry_coef and reward_coef all are. Leave the callback out."
                 )
             self._has_warned = True
             return
@@ -92,8 +92,8 @@ class LatentCallback(BaseCallback):
 
 def scalars(found: Diagnostics) -> dict[str, float]:
     """
-    :param found: of :func:`~sb3_eqr.visualize.diagnostics.diagnose`
-    :return: what is worth a curve; NaN for what does not exist
+    :param found: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
+    :return: the metrics to log as curves; NaN for undefined ones
     """
     skill, gain = skill_and_gain(found.loss)
     blocks = found.disentanglement

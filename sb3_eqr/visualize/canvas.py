@@ -1,4 +1,4 @@
-"""The frames of a video, drawn by matplotlib: the game on the left, a panel per block on the right."""
+"""Draw the frames of a video with matplotlib: the environment on the left, a panel per block on the right."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from sb3_eqr.plot_style import GREY, INK, settings
 from sb3_eqr.visualize.sketches import ROOM, Panel, Shape
 
-WIDTH, HEIGHT = 900, 500  # pixels; even: H.264 asks for it
+WIDTH, HEIGHT = 900, 500  # pixels; even, as H.264 requires
 DPI = 100
 TRAIL = 12  # steps
 NOW, PREDICTED = "#1446a0", "#f49840"
@@ -22,7 +22,7 @@ PREDICTED_AXES = ("#f2b2b2", "#acdcb4", "#b2c6f4")
 
 
 class Line(NamedTuple):
-    """What is said above a frame."""
+    """The line of text above a frame."""
 
     step: int
     action: str
@@ -32,12 +32,12 @@ class Line(NamedTuple):
 
 class Block:
     """
-    One block in its panel: an arrow, axes or a parallelogram, a dot, and a triangle at the edge where it lies beyond.
+    One block in its panel: an arrow, axes or a parallelogram, a dot, and a triangle at the edge if it is beyond the edge.
 
-    :param ax: with limits of ±1
-    :param panel: of the block
-    :param shape: of the panel, true or predicted
-    :param is_predicted: how it is drawn
+    :param ax: axes with limits of ±1
+    :param panel: panel of the block
+    :param shape: the panel's true or predicted shape
+    :param is_predicted: whether the shape is predicted, which is drawn differently
     """
 
     def __init__(self, ax: Axes, panel: Panel, shape: Shape, is_predicted: bool):
@@ -60,7 +60,7 @@ class Block:
         self.is_parallelogram = panel.kind == "parallelogram"
 
     def move(self, t: int) -> list[Artist]:
-        """:return: what is to be drawn at a moment, none where nothing is known"""
+        """:return: the artists to draw at step t; none where the shape is NaN"""
         arrows, foot = (None if part is None else part[t] for part in self.shape)
         if not all(part is None or np.isfinite(part).all() for part in (arrows, foot)):
             return []
@@ -88,9 +88,9 @@ class Painter:
     Draws the frames of one video.
 
     :param panels: one per block
-    :param starts: the frame at which the episode of each frame began, (T,)
+    :param starts: the frame at which each frame's episode began, (T,)
     :param depth: M, for the legend
-    :param about: what the agent is, at the foot
+    :param about: description of the agent, at the bottom
     """
 
     def __init__(self, panels: Sequence[Panel], starts: np.ndarray, depth: int, about: str):
@@ -104,7 +104,7 @@ class Painter:
             self.game = self.figure.add_axes((0.01, 0.08, 0.37, 0.84))
             self.game.set_axis_off()
             side = min(0.59 * WIDTH / columns, 0.82 * HEIGHT / rows)  # of a panel, in pixels
-            x, y = columns * side / WIDTH / 2, rows * side / HEIGHT / 2  # half of all panels, in parts of the frame
+            x, y = columns * side / WIDTH / 2, rows * side / HEIGHT / 2  # half of all panels, as fractions of the frame
             ends = {"left": 0.695 - x, "right": 0.695 + x, "bottom": 0.51 - y, "top": 0.51 + y}
             grid = self.figure.add_gridspec(rows, columns, wspace=0.05, hspace=0.05, **ends)
             self.axes = [
@@ -128,7 +128,7 @@ class Painter:
         if panel.truth.dots is None:
             ax.axhline(0, color="#dadee3", linewidth=1)
             ax.axvline(0, color="#dadee3", linewidth=1)
-        if panel.kind == "arrow" and panel.truth.dots is None:  # where its tip may be
+        if panel.kind == "arrow" and panel.truth.dots is None:  # a circle for the arrow's tip
             turn = np.linspace(0, 2 * np.pi, 100)
             ax.plot(ROOM * np.cos(turn), ROOM * np.sin(turn), color="#dadee3", linewidth=1)
         size = 8 if len(self.panels) < 13 else 6
@@ -153,13 +153,13 @@ class Painter:
 
     def paint(self, t: int, picture: np.ndarray, line: Line) -> np.ndarray:
         """
-        :param t: which moment
-        :param picture: of the game, (height, width, 3), uint8
-        :param line: for the title
+        :param t: index of the step
+        :param picture: the environment's image, (height, width, 3), uint8
+        :param line: content of the title
         :return: (HEIGHT, WIDTH, 3), uint8
         """
         self.canvas.restore_region(self.ground)  # type: ignore[attr-defined]
-        if self.picture is None:  # small ones with hard edges
+        if self.picture is None:  # small images are enlarged without smoothing
             smooth = "antialiased" if min(picture.shape[:2]) > 100 else "nearest"
             self.picture = self.game.imshow(picture, interpolation=smooth, animated=True)
             self.game.apply_aspect()

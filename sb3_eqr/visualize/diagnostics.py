@@ -1,4 +1,4 @@
-"""What an agent's latent model has learned, in numbers."""
+"""Metrics of what an agent's latent model has learned."""
 
 from typing import NamedTuple
 
@@ -23,53 +23,53 @@ from sb3_eqr.visualize.findings import (
 from sb3_eqr.visualize.latents import Play, action_elements, check_agent, eval_mode, latents
 from sb3_eqr.visualize.measures import Rewards, Transition
 
-MAX_STATES = 256  # in which κ is asked for every action: a table of means needs no more
-PREDICTS = 0.25  # the least skill, and the least gain
+MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
+PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
     "predicts": "The latent model predicts: {removed}. Nothing needs to be done.",
     "does not predict": "The latent model does not predict: {removed}. Train longer, with prediction_depth and aet_coef above "
-    "0; where that changes nothing, transition.csv says at which step it fails.",
-    "collapsed": "The latent states have collapsed, all of them are nearly one: {removed}. Keep reward_coef above 0, lower "
+    "0; if that does not help, transition.csv shows at which step it fails.",
+    "collapsed": "The latent states have collapsed to nearly a single one: {removed}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
 }
-COLLAPSED = 1e-3  # of squared distance on the unit sphere: directions within two degrees of each other
+COLLAPSED = 1e-3  # squared distance on the unit sphere: directions within two degrees of each other
 
 
 class Diagnostics(NamedTuple):
-    """What :func:`diagnose` finds. M steps ahead, A actions, K blocks, F factors."""
+    """The result of :func:`diagnose`. M steps ahead, A actions, K blocks, F factors."""
 
     blocks: list[str]  # (K,): "SE(2) 0", ...
     transition: Transition  # in the latent space
-    loss: Transition  # the same between p(x̂_m) and p(x_m) on the unit sphere: the distance of Eq. 18, which is trained
+    loss: Transition  # the same between p(x̂_m) and p(x_m) on the unit sphere: the distance of Eq. 18, which training uses
     motion: Motion
     generators: list[Generators]  # one per group
     disentanglement: Disentanglement
-    action_symmetry: ActionSymmetry | None  # None where the group has no inverse
+    action_symmetry: ActionSymmetry | None  # None if the group has no inverse
     collapse: Collapse
     rewards: Rewards
     verdict: str  # "predicts", "does not predict" or "collapsed"
     rewards_trained: bool = True  # whether the agent's settings train its reward predictor
-    symmetry_trained: bool = True  # and ρ
+    symmetry_trained: bool = True  # the same for ρ
 
     @property
     def summary(self) -> str:
-        """The verdict in one plain sentence, and what to do in a second one."""
+        """The verdict in one sentence, and what to do in a second one."""
         skill, gain = skill_and_gain(self.loss)
         removed = (
-            f"over {len(self.loss.error)} steps it removes {_share(skill)} of the error of knowing nothing and {_share(gain)} "
-            "of that of standing still"
+            f"over {len(self.loss.error)} steps it removes {_share(skill)} of the error of shuffled targets and "
+            f"{_share(gain)} of that of standing still"
         )
         return SENTENCES[self.verdict].format(removed=removed)
 
 
 def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     """
-    Every number of this module. No global random generator is used.
+    Compute all metrics. No global random generator is used.
 
     :param model: any EqR agent
-    :param play: of :func:`~sb3_eqr.visualize.latents.play` or :func:`~sb3_eqr.visualize.latents.replayed`
-    :param seed: draws the pairs of ``action_symmetry``
-    :raises ValueError: if the agent is no EqR agent
+    :param play: see :func:`~sb3_eqr.visualize.latents.play` and :func:`~sb3_eqr.visualize.latents.replayed`
+    :param seed: seed for the pairs of ``action_symmetry``
+    :raises ValueError: if the agent is not an EqR agent
     """
     check_agent("diagnose", model)
     data = latents(model, play.samples)
@@ -102,13 +102,13 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
 
 def find_verdict(loss: Transition) -> str:
     """
-    - "predicts": the rollout explains a quarter of what knowing nothing leaves open, and of what standing still does.
-      An untrained agent whose states differ may do the first, for its κ moves them little, but not the second.
-    - "collapsed": else, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are one, and κ
-      leaves it where it is. In an untrained agent the states may be nearly one, but κ moves them away from it.
-    - "does not predict": else.
+    - "predicts": the rollout removes at least a quarter of the error of shuffled targets, and of that of standing still.
+      An untrained agent whose states differ may achieve the first, since its κ moves them little, but not the second.
+    - "collapsed": otherwise, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are
+      equal, and κ does not move them. In an untrained agent the states may be nearly equal, but κ moves them.
+    - "does not predict": otherwise.
 
-    :param loss: on the unit sphere
+    :param loss: errors on the unit sphere
     """
     skill, gain = skill_and_gain(loss)
     if skill >= PREDICTS and gain >= PREDICTS:
@@ -118,7 +118,8 @@ def find_verdict(loss: Transition) -> str:
 
 def skill_and_gain(errors: Transition) -> tuple[float, float]:
     """
-    :return: of all steps ahead together, so that a step in which nothing moves has no weight; NaN where nothing ever does
+    :return: skill and gain over all steps ahead, so that a step in which nothing moves has no weight; NaN if undefined at
+        every step
     """
     error, shuffled, still = (_mean(x, errors.n_windows) for x in (errors.error, errors.shuffled, errors.still))
     known = [~np.isnan(x).all() for x in (errors.skill, errors.gain)]

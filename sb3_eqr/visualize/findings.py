@@ -1,4 +1,4 @@
-"""What each part of a diagnosis looks at: motion, generators, blocks, the action symmetry, collapse."""
+"""The components of the diagnostics: motion, generators, disentanglement, action symmetry, collapse."""
 
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ class Motion(NamedTuple):
     """How far actions move blocks. K counts the blocks of all groups."""
 
     predicted: np.ndarray  # (A, K): mean ‖κ(x, a) · x − x‖ in the block, over all states
-    observed: np.ndarray  # (A, K): mean ‖x₁ − x₀‖ in the block, where a was played; NaN where it never was
+    observed: np.ndarray  # (A, K): mean ‖x₁ − x₀‖ in the block, where a was taken; NaN if it never was
 
 
 class Generators(NamedTuple):
@@ -33,12 +33,12 @@ class Generators(NamedTuple):
 
 
 class Disentanglement(NamedTuple):
-    """Whether actions, blocks and factors go one with one."""
+    """Whether actions, blocks and factors correspond one to one."""
 
     opposites: list[int]  # (A,): the action that undoes each action, or itself
-    specificity: np.ndarray  # (K,): 1 − H / log A of a block's motion over actions, opposites taken as one
+    specificity: np.ndarray  # (K,): 1 − H / log A of a block's motion over actions, opposites merged
     redundancy: np.ndarray  # (K, K): mean canonical correlation between blocks
-    information: np.ndarray | None  # (K, F): of block and factor, over the factor's entropy; None: factors unknown
+    information: np.ndarray | None  # (K, F): of block and factor, over the factor's entropy; None if factors are unknown
     gap: np.ndarray | None  # (F,): mutual information gap
 
 
@@ -52,7 +52,7 @@ class ActionSymmetry(NamedTuple):
 
 
 class Collapse(NamedTuple):
-    """How much of the latent space is used."""
+    """How much of the latent space the states use."""
 
     size: float  # root mean square ‖x‖
     spread: float  # root mean square ‖x − mean x‖, over the size
@@ -60,17 +60,17 @@ class Collapse(NamedTuple):
     dimensions: int  # D
     spectrum: np.ndarray  # (min(N, D),): standard deviations along the principal axes
     n_units: int  # outputs of the trunk
-    dead_units: float  # fraction of them that are constant over all observations
+    dead_units: float  # fraction of units that are constant over all observations
     dormant_units: float  # fraction with mean |h| ≤ 0.025 of the layer's mean
 
 
 def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
     """
-    Distances in the block rather than sizes of κ: they exist for every group, "none" as well, and are in the units of the
-    transition's error.
+    Distances in the block rather than sizes of κ: they are defined for every group, including "none", and have the units of
+    the transition error.
 
     :param states: (n, D)
-    :param elements: κ of every action there, (n, A, D)
+    :param elements: κ of every action in these states, (n, A, D)
     """
     latent_model = group_model(model)
     n_actions = latent_model.n_actions
@@ -79,7 +79,7 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
     predicted = _block_norms(model, moved - before).unflatten(0, (-1, n_actions)).mean(dim=0)  # (A, K)
     steps = _block_norms(model, data.next_states[:, 0] - data.states)  # (N, K)
     played = F.one_hot(data.actions[:, 0], n_actions).to(steps.dtype)  # (N, A)
-    observed = played.T @ steps / played.sum(dim=0)[:, None]  # 0 / 0 where never played
+    observed = played.T @ steps / played.sum(dim=0)[:, None]  # 0 / 0 if never taken
     return Motion(_numpy(predicted), _numpy(observed))
 
 
@@ -103,10 +103,11 @@ def find_disentanglement(
     model: EqRAlgorithm, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
 ) -> Disentanglement:
     """
-    A block's information on a factor is that of its turn or of its shift, whichever has more: each is less than the whole's.
+    A block's information about a factor is that of its rotation or of its translation, whichever is larger; either is a lower
+    bound on the block's.
 
     :param states: (N, D)
-    :param factors: (N, F), where known
+    :param factors: (N, F), if known
     """
     vectors = np.concatenate([part.mean.reshape(len(part.mean), -1) for part in generators], axis=1)  # (A, ...)
     opposites = measures.opposites(vectors)
@@ -129,9 +130,9 @@ def _information(parts: list[np.ndarray], factor: np.ndarray) -> float:
 
 def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Generator) -> ActionSymmetry | None:
     """
-    ρ's effect in Eq. 19, by the online networks throughout.
+    The effect of ρ in Eq. 19, computed with the online networks only.
 
-    :param rng: draws each state's partner
+    :param rng: generator that draws each state's partner
     """
     latent_model = group_model(model)
     group, n = latent_model.group, len(data.states)
@@ -139,7 +140,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
         return None
     order = rng.permutation(n)
     partner = np.empty(n, dtype=int)
-    partner[order] = np.roll(order, 1)  # never itself
+    partner[order] = np.roll(order, 1)  # never the state itself
     state, other = (x.unflatten(1, (-1, *group.element_shape)) for x in (data.states, data.states[partner]))
     with th.no_grad(), eval_mode(model):
         symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
@@ -159,7 +160,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
 def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchObs) -> Collapse:
     """
     :param states: (N, D)
-    :param observations: the N they are of
+    :param observations: the observations of these states, N
     """
     size = float(states.double().square().sum(dim=1).mean().sqrt())
     spectrum = measures.spectrum(states)
@@ -173,10 +174,10 @@ def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchO
 
 
 def _activity(model: EqRAlgorithm, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """:return: least, greatest and mean absolute output of each unit of the trunk, (U,) each"""
+    """:return: minimum, maximum and mean absolute output of each unit of the trunk, (U,) each"""
     trunk: Any = model.policy.online.features_extractor
     while isinstance(trunk, (GroupFeaturesExtractor, NormalizedExtractor)):
-        trunk = trunk.trunk  # behind a layer norm, a unit that is always 0 is no constant
+        trunk = trunk.trunk  # after a layer norm, a unit that is always 0 is not constant
     seen: list[th.Tensor] = []
     hook = trunk.register_forward_hook(lambda _module, _inputs, output: seen.append(output.flatten(1)))
     try:

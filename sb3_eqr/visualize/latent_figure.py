@@ -1,4 +1,4 @@
-"""The blocks of latent states as points in the plane: cheap enough to be drawn while an agent trains."""
+"""A scatter plot of the blocks of latent states, fast enough to draw during training."""
 
 from typing import Any
 
@@ -15,24 +15,24 @@ from sb3_eqr.plot_style import GREY, settings
 from sb3_eqr.visualize.latents import frame, split
 from sb3_eqr.visualize.measures import ROUNDING
 
-SIZE = (6.0, 4.0)  # inches, of every picture
+SIZE = (6.0, 4.0)  # inches, for all figures
 MAX_PANELS = 12
 MAX_POINTS = 400
 MAX_ARROWS = 150
-ABOUT = "A point is a state: where a block moves the origin to, an arrow what it turns; or principal components."
-CYCLIC = ("position", "angle")  # factors whose ends may be one: they get a colour map without a seam
+ABOUT = "A point per state: a block's translation, an arrow for its rotation, or its principal components."
+CYCLIC = ("position", "angle")  # factors that may wrap around: they get a cyclic colour map
 
 
 def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time") -> Figure:
     """
-    A panel per block, of at most 12 those that vary most: SO(2) as points on the circle (where it takes the vector (1, 0), as
-    in Figure 3 of the paper); what shifts the plane, SE(2) and T(2), as points there, with the direction of what turns; one
-    number over the windows; anything else by its first two principal components.
+    A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in
+    Figure 3 of the paper); SE(2) and T(2) are points in the plane, with the direction of any rotation; a single number is
+    plotted over the windows; anything else is projected to its first two principal components.
 
-    :param model: whose latents these are
-    :param states: of :func:`~sb3_eqr.visualize.latents.encode`, (N, D)
-    :param values: that colour them, (N,); the order of the states where not given
-    :param label: what the colours mean
+    :param model: the agent
+    :param states: see :func:`~sb3_eqr.visualize.latents.encode`, (N, D)
+    :param values: values for the colours, (N,); default: the order of the states
+    :param label: label of the colours
     """
     kept = np.unique(np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int))
     colours = (np.arange(len(states)) if values is None else np.asarray(values))[kept]
@@ -44,7 +44,7 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
     shown = sorted(np.argsort(-spreads, kind="stable")[:MAX_PANELS])
     cyclic = label.split(" ")[0] in CYCLIC
     with settings():
-        figure = Figure(figsize=SIZE)  # a constrained layout would take longer than all the drawing
+        figure = Figure(figsize=SIZE)  # a constrained layout would take longer than the drawing itself
         axes = panels(figure, len(shown))
         for ax, i in zip(axes, shown, strict=True):
             group, name, found = blocks[i]
@@ -56,7 +56,7 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
         figure.subplots_adjust(left=0.07, right=0.85, bottom=0.07, top=0.87, wspace=0.35, hspace=0.45)
         bar = figure.colorbar(drawn, cax=figure.add_axes((0.88, 0.12, 0.02, 0.7)))
         bar.set_label("time (steps)" if label == "time" else label)
-        of_all = "" if len(shown) == len(blocks) else f" ({len(shown)} of {len(blocks)} blocks: those that vary most)"
+        of_all = "" if len(shown) == len(blocks) else f" ({len(shown)} of {len(blocks)} blocks, those that vary most)"
         figure.suptitle(f"Latent states{of_all}", fontsize=10)
         figure.text(0.46, 0.005, ABOUT, ha="center", fontsize=7, color=GREY)
         return figure
@@ -64,14 +64,14 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
 
 def n_columns(count: int) -> int:
     """
-    :param count: of panels
+    :param count: number of panels
     """
     return 4 if count > 4 else min(count, 2)
 
 
 def panels(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
     """
-    :return: so many axes, in rows of at most four
+    :return: ``count`` axes, in rows of at most four
     """
     columns = n_columns(count)
     rows = -(-count // columns)
@@ -83,10 +83,10 @@ def panels(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
 
 def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap: str) -> PathCollection:
     """
-    :param elements: of one block, (n, *element_shape)
+    :param elements: elements of one block, (n, *element_shape)
     :param colours: (n,)
-    :param cmap: matplotlib's name of their colour map
-    :return: for the colour bar
+    :param cmap: matplotlib's name of the colour map
+    :return: the points, for the colour bar
     """
     low, high = float(colours.min()), float(colours.max())
     matrix, vector = frame(group, elements)
@@ -112,7 +112,7 @@ def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap
 
 
 def _roomy(ax: Axes, points: np.ndarray) -> None:
-    """Equal scales, no zoom into rounding, and none out to the few first pictures of an episode (the title counts them)."""
+    """Equal scales, without zooming in on rounding or out to an episode's few first states (the title counts them)."""
     low, high = np.percentile(points, (1, 99), axis=0)  # (2,) each
     middle = (low + high) / 2
     half = max(0.7 * float((high - low).max()), 1e-6 * float(np.abs(middle).max()), 1e-9)

@@ -1,4 +1,4 @@
-"""The latent states of an agent on windows of play: what every diagnostic, picture and animation looks at."""
+"""The latent states of an agent on windows of steps: the input of all metrics, figures and animations."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,15 +21,15 @@ from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 from sb3_eqr.common.validation import check_number
 
 CHUNK = 256  # observations encoded at once
-# What an environment tells of its true state, under these keys of ``info``; the worlds of sb3_eqr.envs do.
+# Keys of ``info`` under which an environment may report its true state, as those of sb3_eqr.envs do.
 FACTOR_KEYS = ("position", "angle", "velocity", "rotation", "translation")
 
 
 class Play(NamedTuple):
-    """Windows of play: N starts, M steps ahead of each."""
+    """Windows of an agent's steps: N starts, with the M steps after each."""
 
     samples: SequenceReplayBufferSamples
-    factors: np.ndarray | None  # (N, F): the true state at each start, where the environment's ``info`` tells it
+    factors: np.ndarray | None  # (N, F): the true state at each start, if the environment's ``info`` reports it
 
 
 class Latents(NamedTuple):
@@ -38,7 +38,7 @@ class Latents(NamedTuple):
     states: th.Tensor  # (N, D): x₀ = τ(s_t)
     next_states: th.Tensor  # (N, M, D): x₁ ... x_M, encoded
     predicted: th.Tensor  # (N, M, D): x̂₁ ... x̂_M, rolled out from x₀
-    predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m); the sign's expectation where the reward loss is categorical
+    predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m); the expected sign if the reward loss is categorical
     actions: th.Tensor  # (N, M), int64
     rewards: th.Tensor  # (N, M)
     mask: th.Tensor  # (N, M): 1 where the episode had not ended before step t+m
@@ -53,18 +53,18 @@ class Blocks(NamedTuple):
 
 def check_agent(name: str, model: Any) -> None:
     """
-    :param name: of what asks, for the message
-    :raises ValueError: if the model is no EqR agent
+    :param name: name of the caller, for the message
+    :raises ValueError: if the model is not an EqR agent
     """
     if not isinstance(model, EqRAlgorithm):
         found = type(model).__name__
-        raise ValueError(f"{name}: expected an EqR agent (EqRQRDQN, EqRRainbow), found {found}, which has no latent model.")
+        raise ValueError(f"{name} needs an EqR agent (EqRQRDQN, EqRRainbow), got {found}, which has no latent model.")
 
 
 def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
     """
-    :param env: or its id of gymnasium
-    :return: images channels first, as the agent's own environment
+    :param env: the environment, or its gymnasium id
+    :return: the environment, with images channels first as in training
     """
     return model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
 
@@ -73,16 +73,16 @@ def play(
     model: EqRAlgorithm, env: GymEnv | str, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
 ) -> Play:
     """
-    Let the agent play, and cut the play into windows. Every random generator but the environments' is left as it was.
+    Run the agent and collect windows of its steps. All random generators except the environments' keep their states.
 
     :param model: any EqR agent
-    :param env: with the agent's observations and actions, preprocessed as in training; or its id of gymnasium
-    :param n_steps: over all environments, at least 2 · depth + 2 each
-    :param depth: M ≥ 1, how many steps each window looks ahead
-    :param deterministic: whether the agent acts without noise; else as it explores
-    :param seed: of the environment and of the agent's noise
-    :return: every window that was complete, in order
-    :raises ValueError: if there are too few steps, or the agent is no EqR agent
+    :param env: an environment with the agent's spaces, preprocessed as in training; or its gymnasium id
+    :param n_steps: number of steps over all environments, at least 2 · depth + 2 each
+    :param depth: M ≥ 1, number of steps in each window
+    :param deterministic: whether the agent acts without noise instead of exploring
+    :param seed: seed of the environment and of the agent's noise
+    :return: all complete windows, in order
+    :raises ValueError: if there are too few steps, or the agent is not an EqR agent
     """
     check_agent("play", model)
     env = as_vec_env(model, env)
@@ -92,7 +92,7 @@ def play(
         n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
     )
     factors: list[np.ndarray | None] = []
-    with preserved_rng_state(model.action_space, env.action_space):  # a random action is drawn from the first
+    with preserved_rng_state(model.action_space, env.action_space):  # the first draws random actions
         set_random_seed(seed)
         model.action_space.seed(seed)
         env.seed(seed)
@@ -108,25 +108,25 @@ def play(
             ]
             obs = new_obs
     starts, envs = (grid.ravel() for grid in np.meshgrid(np.arange(buffer.n_starts), np.arange(env.num_envs), indexing="ij"))
-    samples = buffer.windows(starts, envs)  # a VecNormalize has normalised them already
+    samples = buffer.windows(starts, envs)  # already normalised by a VecNormalize
     known = all(found is not None for found in factors)
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
 
 
 def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> Play:
     """
-    Windows from the agent's own replay buffer, drawn uniformly; no global generator is used.
+    Windows drawn uniformly from the agent's replay buffer; no global random generator is used.
 
     :param model: an agent in training, with ``prediction_depth`` ≥ 1
     :param n_windows: N
-    :param rng: draws them
-    :raises ValueError: if there is no window yet
+    :param rng: generator that draws the windows
+    :raises ValueError: if there is no complete window yet
     """
     buffer = model.replay_buffer
     if buffer is None or buffer.prediction_depth == 0 or buffer.n_starts < 1:
         raise ValueError(
-            "replayed: expected a replay buffer that holds whole windows, found none. Train the agent first, "
-            "with prediction_depth >= 1; for an agent that was loaded, let it play (sb3_eqr.visualize.play)."
+            "replayed needs a replay buffer with complete windows, got none. Train the agent first, with "
+            "prediction_depth >= 1; for a loaded agent, use sb3_eqr.visualize.play instead."
         )
     starts = rng.integers(0, buffer.n_starts, n_windows)
     envs = rng.integers(0, buffer.n_envs, n_windows)
@@ -137,22 +137,22 @@ def group_model(model: EqRAlgorithm) -> GroupLatentModel:
     """
     The agent's latent model.
 
-    :raises ValueError: if it is not one of groups
+    :raises ValueError: if it does not use groups
     """
     found = model.policy.latent_model
     if not isinstance(found, GroupLatentModel):
-        raise ValueError(f"expected an agent whose latent model moves states by group elements, found {type(found).__name__}")
+        raise ValueError(f"The agent's latent model must be a GroupLatentModel, got {type(found).__name__}.")
     return found
 
 
 def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """
-    x = τ(s), by the online encoder in eval mode.
+    x = τ(s), computed by the online encoder in eval mode.
 
     :param model: any EqR agent
-    :param observations: as the replay buffer has them, (N, *obs_shape) or a dict of these
+    :param observations: in the format of the replay buffer, (N, *obs_shape) or a dict of these
     :return: (N, D), without gradient
-    :raises ValueError: if the agent is no EqR agent
+    :raises ValueError: if the agent is not an EqR agent
     """
     check_agent("encode", model)
     n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
@@ -198,7 +198,7 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     κ(x, a) of every action in every state.
 
     :param states: (N, D)
-    :return: flat, as states are, (N, A, D), without gradient
+    :return: flat like the states, (N, A, D), without gradient
     """
     latent_model = group_model(model)
     n, n_actions = len(states), latent_model.n_actions
@@ -210,8 +210,8 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
 
 def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
     """
-    :param states: or actions' elements, (..., D)
-    :return: the blocks, one entry per group: a product's factors one by one
+    :param states: states or elements of actions, (..., D)
+    :return: the blocks, one entry per group; each factor of a product has its own entry
     """
     latent_model = group_model(model)
     group = latent_model.group
@@ -229,12 +229,12 @@ def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
 
 def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
     """
-    An element as a moving frame: what turns (or shears), and what shifts. An element that is no matrix is a vector.
+    An element as a frame: a matrix that rotates (or shears) and a translation. An element that is not a matrix is a vector.
 
     :param elements: (..., *element_shape)
     :return: a matrix, (..., n, n), or ``None``; a vector, (..., n), or ``None``
     """
-    if not isinstance(group, MatrixGroup):  # T, none, and a group of one's own
+    if not isinstance(group, MatrixGroup):  # T, none, and user-defined groups
         return None, elements.reshape(*elements.shape[: elements.dim() - len(group.element_shape)], -1)
     if group.is_affine:
         return elements[..., :-1], elements[..., -1]
@@ -243,9 +243,9 @@ def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tenso
 
 def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
     """
-    An element in numbers that are 0 at the identity: the angles of a rotation's logarithm, radians in (-π, π], one per
-    plane i < j; the entries less the identity's where the matrix is no rotation; then the translation. The entries less the
-    identity's of an element that is no matrix.
+    Coordinates of an element that are 0 at the identity: for a rotation, the angles of its logarithm, radians in (-π, π], one
+    per plane i < j; for another matrix, its entries minus the identity's; then the translation. For an element that is not a
+    matrix, its entries minus the identity's.
 
     :param elements: (..., *element_shape)
     :return: (..., C), C = len(coordinate_names(group))
@@ -265,7 +265,7 @@ def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
 
 def coordinate_names(group: Group) -> list[str]:
     """
-    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... where an element is no matrix
+    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... if elements are not matrices
     """
     matrix, vector = frame(group, th.zeros(group.element_shape))
     names = []
@@ -286,29 +286,29 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
     if n == 2:
         return th.atan2(rotation[..., 0, 1] - rotation[..., 1, 0], rotation[..., 0, 0] + rotation[..., 1, 1])[..., None]
     rotation = rotation.to(th.float64)
-    # A half turn has -1 twice, which says nothing of its plane: 10⁻⁷ rad about an odd axis tell the two apart.
+    # A half turn has the eigenvalue -1 twice, which does not determine its plane: a rotation by 10⁻⁷ rad separates the two.
     aside = 1e-7 * th.linspace(0.5, 1, n * n, dtype=th.float64, device=rotation.device).sqrt().view(n, n).triu(1)
-    values, vectors = th.linalg.eig(rotation @ th.matrix_exp(aside - aside.mT))  # a rotation is normal: these are a basis
+    values, vectors = th.linalg.eig(rotation @ th.matrix_exp(aside - aside.mT))  # a basis, as a rotation is normal
     log = (vectors * (1j * values.angle())[..., None, :] @ th.linalg.inv(vectors)).real
     i, j = th.triu_indices(n, n, 1)
     return log[..., i, j].to(dtype)
 
 
 def _is_own(group: Group) -> bool:
-    """Whether it is a group of the user's own whose elements are no matrices."""
+    """:return: whether this is a user-defined group whose elements are not matrices"""
     return not isinstance(group, (MatrixGroup, T, NoGroup))
 
 
 def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
     """
-    :return: (n_envs, F); ``None`` where an environment does not tell
+    :return: (n_envs, F); ``None`` if an environment does not report its true state
     """
     found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
     return np.array([np.concatenate(row) for row in found]) if all(found) else None
 
 
 def _true_next(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
-    """The terminal observation where an episode has ended."""
+    """:return: the next observations, with the terminal one where an episode has ended"""
     if isinstance(new_obs, dict):
         return {
             key: _true_next(
@@ -331,7 +331,7 @@ def _map(observations: PyTorchObs, function) -> Any:
 
 @contextmanager
 def eval_mode(model: EqRAlgorithm) -> Iterator[None]:
-    """The policy in eval mode within the ``with`` block, then as it was."""
+    """Put the policy into eval mode, and restore its modes on exit."""
     modes = [(module, module.training) for module in model.policy.modules()]
     model.policy.eval()
     try:

@@ -1,4 +1,4 @@
-"""A saved agent, and the environment that it was trained in."""
+"""Load a saved agent and the environment that it was trained in."""
 
 import ast
 import difflib
@@ -23,27 +23,27 @@ from sb3_eqr.visualize.trust import check_statistics, check_zoo_folder
 
 def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqRAlgorithm:
     """
-    :param path: of a file that ``save`` wrote
-    :param algo: one of ``AGENTS``; found out where not given
-    :param device: of PyTorch
+    :param path: path of a file written by ``save``
+    :param algo: one of ``AGENTS``; default: detected from the file
+    :param device: PyTorch device
     :param trust: as in ``load``
-    :raises ValueError: if there is no such file, or it holds something else
+    :raises ValueError: if the file does not exist or is not a saved agent
     """
     if not path.is_file():
-        raise ValueError(f"MODEL: expected the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, found {str(path)!r}")
+        raise ValueError(f"MODEL must be the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, got {str(path)!r}.")
     if not is_whole_model(path):
-        raise ValueError(f"{path}: expected a whole file of an agent's save, found one that is truncated or something else")
+        raise ValueError(f"{path} must be a file written by an agent's save, got a truncated file or another kind of file.")
     try:
         return AGENTS[algo or find_algorithm(path)].load(path, device=device, trust=trust)
     except (TypeError, RuntimeError) as error:
-        raise ValueError(f"{path}: expected an agent saved by this version of sb3_eqr and by --algo: {error}") from error
+        raise ValueError(f"{path} must be an agent of --algo, saved by this version of sb3_eqr: {error}") from error
 
 
 def find_algorithm(path: pathlib.Path) -> str:
     """
-    By the module of the policy's class, which is plain text: nothing is unpickled.
+    Detect the algorithm from the module of the policy's class, which is plain text: nothing is unpickled.
 
-    :param path: of a whole file
+    :param path: path of a complete file
     :return: one of ``AGENTS``
     :raises ValueError: if the policy is not one of this package's
     """
@@ -55,8 +55,8 @@ def find_algorithm(path: pathlib.Path) -> str:
         if module.startswith(f"sb3_eqr.{name}."):
             return name
     raise ValueError(
-        f"{path}: expected an agent of {' or '.join(kind.__name__ for kind in AGENTS.values())}, found one whose policy "
-        f"is of {module}. Pass --algo if that is a class of your own for one of them."
+        f"{path} must be a saved {' or '.join(kind.__name__ for kind in AGENTS.values())}, got one whose policy is from "
+        f"{module}. Pass --algo if that is your own policy class for one of them."
     )
 
 
@@ -71,18 +71,18 @@ def make_env(
     trust: bool = False,
 ) -> VecEnv:
     """
-    The environment as in training. What RL Zoo wrote beside the model says it; for another, Atari is preprocessed as by
-    :func:`~sb3_eqr.envs.make_atari100k_env`. Statistics of ``VecNormalize`` beside the model are used, and stay as they are.
+    The environment as in training, from RL Zoo's files next to the model. Without them, Atari is preprocessed as by
+    :func:`~sb3_eqr.envs.make_atari100k_env`. Statistics of ``VecNormalize`` next to the model are used, and not updated.
 
     :param model: the agent
-    :param path: where it was loaded from
-    :param env_id: of gymnasium; RL Zoo's where not given
-    :param env_kwargs: of its constructor
+    :param path: path that the agent was loaded from
+    :param env_id: gymnasium id; default: RL Zoo's
+    :param env_kwargs: arguments of the environment's constructor
     :param n_envs: number of environments
-    :param seed: of the first environment
-    :param render: whether it is asked to draw itself
-    :param trust: whether the files beside the model may name code that runs
-    :raises ValueError: if no environment is known, it is not the agent's, or its files need ``trust``
+    :param seed: seed of the first environment
+    :param render: whether the environment is made to render
+    :param trust: whether the files next to the model may name code that runs
+    :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
     :raises ImportError: if RL Zoo or the environment is not installed
     """
     sb3_eqr.envs.register()
@@ -93,10 +93,10 @@ def make_env(
     if zoo is not None and env_id in (None, zoo_arguments(zoo)["env"]):
         env = _zoo_env(zoo, kwargs, n_envs, seed, render)
     elif env_id is None:
-        raise ValueError(f"--env: expected the environment of the agent, for RL Zoo has left none (args.yml) beside {path}")
+        raise ValueError(f"--env must be the agent's environment, got none, and RL Zoo's args.yml is not next to {path}.")
     elif env_id.startswith("ALE/") or "NoFrameskip" in env_id:
         if kwargs:
-            raise ValueError(f"--env-kwargs: expected none for Atari, whose protocol is fixed, found {kwargs}")
+            raise ValueError(f"--env-kwargs must be empty for Atari, whose protocol is fixed, got {kwargs}.")
         env = sb3_eqr.envs.make_atari100k_env(env_id, n_envs, seed, training=True)
     else:
         env = _plain_env(env_id, kwargs, n_envs, seed)
@@ -113,14 +113,14 @@ def make_env(
         check_for_correct_spaces(env, model.observation_space, model.action_space)
     except ValueError as error:
         advice = "Pass the --env and --env-kwargs of training."
-        raise ValueError(f"--env: the environment is not the agent's. {error}. {advice}") from error
+        raise ValueError(f"--env does not have the agent's spaces. {error}. {advice}") from error
     return env
 
 
 def find_zoo_folder(path: pathlib.Path) -> pathlib.Path | None:
     """
-    :param path: of a model, such as logs/eqr_qrdqn/CartPole-v1_1/best_model.zip
-    :return: the folder beside it that holds args.yml and config.yml, such as CartPole-v1
+    :param path: path of a model, such as logs/eqr_qrdqn/CartPole-v1_1/best_model.zip
+    :return: the folder next to it that contains args.yml and config.yml, such as CartPole-v1
     """
     found = sorted(file.parent for file in path.parent.glob("*/args.yml") if (file.parent / "config.yml").is_file())
     return found[0] if found else None
@@ -128,12 +128,12 @@ def find_zoo_folder(path: pathlib.Path) -> pathlib.Path | None:
 
 def zoo_arguments(folder: pathlib.Path) -> dict[str, Any]:
     """
-    :param folder: of :func:`find_zoo_folder`
-    :return: the command line of ``train``
+    :param folder: see :func:`find_zoo_folder`
+    :return: the arguments of ``train``
     """
     import yaml
 
-    # As RL Zoo reads it: make_env has looked at it, or it is trusted.
+    # Loaded as RL Zoo does: make_env has checked the file, or it is trusted.
     return yaml.load((folder / "args.yml").read_text(encoding="utf-8"), Loader=yaml.UnsafeLoader)
 
 
@@ -141,8 +141,8 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
     try:
         from rl_zoo3.utils import create_test_env, get_saved_hyperparams
     except ImportError as error:
-        advice = 'pip install ".[zoo]" in a clone of the repository'
-        raise ImportError(f"{folder} is of RL Zoo, which is not installed ({error}): {advice}") from error
+        advice = 'Run pip install ".[zoo]" in a clone of the repository.'
+        raise ImportError(f"{folder} needs RL Zoo, which is not installed ({error}). {advice}") from error
     arguments = zoo_arguments(folder)
     for package in arguments.get("gym_packages") or []:
         importlib.import_module(package)
@@ -161,7 +161,7 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
     )
     normalize = unwrap_vec_normalize(env)
     if normalize is not None:
-        normalize.norm_reward = norm_reward  # the reward predictor has learned these
+        normalize.norm_reward = norm_reward  # the reward predictor was trained on these rewards
     return env
 
 
@@ -170,21 +170,21 @@ def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> V
         near = difflib.get_close_matches(env_id, list(gym.registry), n=1)
         raise ValueError(f"--env: {env_id!r} is not registered with gymnasium.{f' Did you mean {near[0]!r}?' if near else ''}")
     try:
-        return make_vec_env(env_id, n_envs, seed, env_kwargs=kwargs)  # which asks for pictures where there are any
+        return make_vec_env(env_id, n_envs, seed, env_kwargs=kwargs)  # sets render_mode where supported
     except TypeError as error:
-        raise ValueError(f"--env-kwargs: {env_id} does not take {kwargs} ({error})") from error
+        raise ValueError(f"--env-kwargs: {env_id} does not accept {kwargs} ({error}).") from error
 
 
 def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
     """
-    :param pairs: "key:value", the value in Python, or a text
-    :raises ValueError: for something else
+    :param pairs: "key:value", where the value is a Python literal or a string
+    :raises ValueError: for another format
     """
     found = {}
     for pair in pairs:
         key, colon, value = pair.partition(":")
         if not (key.isidentifier() and colon):
-            raise ValueError(f"--env-kwargs: expected key:value, found {pair!r}")
+            raise ValueError(f"--env-kwargs must be key:value, got {pair!r}.")
         try:
             found[key] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
@@ -194,7 +194,7 @@ def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
 
 def action_names(env: VecEnv, n_actions: int) -> list[str]:
     """
-    :return: what the environment calls its actions, else their numbers
+    :return: the environment's names of its actions, or else their numbers
     """
     world = env.get_attr("unwrapped", 0)[0]
     names = world.get_action_meanings() if hasattr(world, "get_action_meanings") else []
@@ -203,8 +203,8 @@ def action_names(env: VecEnv, n_actions: int) -> list[str]:
 
 def factor_names(env: VecEnv) -> list[str]:
     """
-    :param env: after a reset
-    :return: of what the environment tells of its true state, in the order of :class:`~sb3_eqr.visualize.latents.Play`
+    :param env: the environment, after a reset
+    :return: names of the factors that the environment reports, in the order of :class:`~sb3_eqr.visualize.latents.Play`
     """
     info = env.unwrapped.reset_infos[0]
     sizes = {key: getattr(info[key], "size", 1) for key in FACTOR_KEYS if key in info}

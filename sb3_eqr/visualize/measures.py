@@ -1,12 +1,12 @@
-"""Pure functions of tensors behind the diagnostics: errors, correlations, information, rank. None draws a random number."""
+"""Deterministic functions of tensors for the diagnostics: errors, correlations, information, rank."""
 
 from typing import NamedTuple
 
 import numpy as np
 import torch as th
 
-ROUNDING = 1e-6  # what varies by less than this part of its size is rounding in single precision
-RANK_TOLERANCE = 1e-3  # directions in which a block varies by less than this part of its widest one are none
+ROUNDING = 1e-6  # relative variation below this is rounding in single precision
+RANK_TOLERANCE = 1e-3  # directions in which a block varies by less than this fraction of its largest are ignored
 BINS = 10  # of a true factor
 CELLS = 32  # of a block
 
@@ -15,25 +15,25 @@ class Transition(NamedTuple):
     """Errors of the rollout, one number per step ahead, m = 1 ... M."""
 
     error: np.ndarray  # (M,): mean ‖x̂_m − x_m‖²
-    shuffled: np.ndarray  # (M,): the same against the x_m of any window: what knowing the average alone gives
-    still: np.ndarray  # (M,): mean ‖x₀ − x_m‖²: what predicting no motion gives
-    skill: np.ndarray  # (M,): 1 − error / shuffled; NaN where all states are one
-    gain: np.ndarray  # (M,): 1 − error / still; NaN where nothing moves
-    n_windows: np.ndarray  # (M,), int: how many windows reach that far
+    shuffled: np.ndarray  # (M,): the same with the x_m of any window, as for a prediction that ignores the state
+    still: np.ndarray  # (M,): mean ‖x₀ − x_m‖², as for a prediction of no motion
+    skill: np.ndarray  # (M,): 1 − error / shuffled; NaN if all states are equal
+    gain: np.ndarray  # (M,): 1 − error / still; NaN if nothing moves
+    n_windows: np.ndarray  # (M,), int: number of windows with at least m steps
 
 
 class Rewards(NamedTuple):
     """Errors of the predicted reward, one number per step ahead, m = 1 ... M."""
 
     error: np.ndarray  # (M,): mean (r_ψ(x̂_m) − r_{t+m})²
-    constant: np.ndarray  # (M,): the same of the mean reward
-    explained: np.ndarray  # (M,): 1 − Var[r − r_ψ] / Var[r]; NaN where no reward varies
+    constant: np.ndarray  # (M,): the same for the mean reward
+    explained: np.ndarray  # (M,): 1 − Var[r − r_ψ] / Var[r]; NaN if the reward is constant
 
 
 def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Tensor, mask: th.Tensor) -> Transition:
     """
-    Equivariance error of the transition, x̂_m against x_m, beside two predictors that know nothing of the actions.
-    The shuffled one is the mean over all pairs of windows, Var[x̂] + Var[x] + ‖mean x̂ − mean x‖², so nothing is drawn.
+    Equivariance error of the transition, x̂_m against x_m, compared with two baselines that ignore the actions.
+    The shuffled one is the mean over all pairs of windows, Var[x̂] + Var[x] + ‖mean x̂ − mean x‖², without sampling.
 
     :param states: x₀, (N, D)
     :param next_states: x₁ ... x_M, (N, M, D)
@@ -58,7 +58,7 @@ def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Te
 
 def reward_error(predicted: th.Tensor, rewards: th.Tensor, mask: th.Tensor) -> Rewards:
     """
-    Reward prediction beside the constant mean; the explained variance is SB3's.
+    Reward prediction compared with the constant mean; the explained variance is defined as in SB3.
 
     :param predicted: (N, M)
     :param rewards: (N, M)
@@ -81,7 +81,7 @@ def _mean_square(left: th.Tensor, right: th.Tensor) -> float:
 
 
 def _one_less(numerator: np.ndarray, denominator: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """:return: 1 − numerator / denominator, NaN where the denominator is rounding"""
+    """:return: 1 − numerator / denominator, NaN where the denominator is only rounding"""
     known = denominator > floor
     return np.where(known, 1 - numerator / np.where(known, denominator, 1), np.nan)
 
@@ -100,11 +100,11 @@ def angle_moments(angles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def concentration(weights: np.ndarray, axis: int) -> np.ndarray:
     """
-    1 − H / log n of weights that are made to sum to 1: 1 where one entry has all, 0 where all have the same.
+    1 − H / log n of the weights normalised to sum to 1: 1 if one entry has all the weight, 0 if all entries are equal.
 
     :param weights: ≥ 0
-    :param axis: n entries
-    :return: without that axis; NaN where n is 1 or all weights are 0
+    :param axis: axis of the n entries
+    :return: the weights' shape without that axis; NaN where n is 1 or all weights are 0
     """
     total = weights.sum(axis=axis, keepdims=True)
     n = weights.shape[axis]
@@ -117,11 +117,11 @@ def concentration(weights: np.ndarray, axis: int) -> np.ndarray:
 
 def opposites(generators: np.ndarray, least: float = 0.8) -> list[int]:
     """
-    Which action undoes which: two that are each other's most opposed, with a cosine below −``least``.
+    Pairs of actions that undo each other: each has the lowest cosine with the other, and it is below −``least``.
 
     :param generators: mean coordinates of each action's element, (A, C)
-    :param least: how opposed they must be
-    :return: for each action its opposite, or itself, (A,)
+    :param least: threshold of the cosine
+    :return: for each action its opposite, or the action itself, (A,)
     """
     norms = np.linalg.norm(generators, axis=1, keepdims=True)
     unit = generators / np.where(norms > 0, norms, 1)
@@ -133,7 +133,7 @@ def opposites(generators: np.ndarray, least: float = 0.8) -> list[int]:
 def merged(weights: np.ndarray, pairs: list[int]) -> np.ndarray:
     """
     :param weights: (A, K)
-    :param pairs: of :func:`opposites`
+    :param pairs: see :func:`opposites`
     :return: (A', K), each action averaged with its opposite
     """
     return np.stack([(weights[a] + weights[b]) / 2 for a, b in enumerate(pairs) if a <= b])
@@ -141,11 +141,11 @@ def merged(weights: np.ndarray, pairs: list[int]) -> np.ndarray:
 
 def canonical_correlations(blocks: list[th.Tensor]) -> np.ndarray:
     """
-    Mean canonical correlation of each two blocks (Hotelling 1936): that of the best matched linear combinations, over the
-    smaller number of directions in which either varies. 1: one can be read off the other linearly; 0: uncorrelated.
+    Mean canonical correlation of every two blocks (Hotelling 1936): that of the best matched linear combinations, over the
+    smaller of their numbers of directions. 1: one is a linear function of the other; 0: uncorrelated.
 
     :param blocks: K of (N, d), each with its own d
-    :return: (K, K), in [0, 1], 1 on the diagonal; 0 where either is constant
+    :return: (K, K), in [0, 1], 1 on the diagonal; 0 if either is constant
     """
     bases = [_directions(x) for x in blocks]
     found = np.eye(len(bases))
@@ -158,7 +158,7 @@ def canonical_correlations(blocks: list[th.Tensor]) -> np.ndarray:
 
 
 def _directions(x: th.Tensor) -> th.Tensor:
-    """:return: an orthonormal basis of what varies, (N, rank)"""
+    """:return: an orthonormal basis of the variation, (N, rank)"""
     x = x.double()
     centred = x - x.mean(dim=0)
     left, values, _ = th.linalg.svd(centred, full_matrices=False)
@@ -168,10 +168,10 @@ def _directions(x: th.Tensor) -> th.Tensor:
 
 def bins(values: np.ndarray, n_bins: int = BINS) -> np.ndarray:
     """
-    Bins that hold about equally many. Any cut of a circle is as good as another, so angles need no care.
+    Bins with about equally many values each. Angles need no special treatment, since a circle may be cut anywhere.
 
     :param values: (N,)
-    :param n_bins: at most so many
+    :param n_bins: maximum number of bins
     :return: labels, (N,), int
     """
     edges = np.unique(np.quantile(values, np.linspace(0, 1, n_bins + 1)[1:-1]))
@@ -180,12 +180,12 @@ def bins(values: np.ndarray, n_bins: int = BINS) -> np.ndarray:
 
 def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np.ndarray:
     """
-    Bins in any number of dimensions: k-means (Lloyd 1982) from points that are each the farthest from those before. On the
-    entries of a rotation a circle has no edge.
+    Bins in any number of dimensions: k-means (Lloyd 1982), initialised with points that are each the farthest from the
+    previous ones. Applied to the entries of a rotation, it has no discontinuity on the circle.
 
     :param points: (N, d)
-    :param n_cells: at most so many
-    :return: labels, (N,), int; all 0 where the points are one
+    :param n_cells: maximum number of cells
+    :return: labels, (N,), int; all 0 if all points are equal
     """
     x = points.double()
     x = x - x.mean(dim=0)
@@ -207,7 +207,7 @@ def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np
 
 def entropy(labels: np.ndarray) -> float:
     """
-    In nats, with Miller's (1955) correction for few samples: (occupied labels − 1) / 2N is added.
+    Entropy in nats, with Miller's (1955) correction for few samples: (occupied labels − 1) / 2N is added.
 
     :param labels: (N,), int
     """
@@ -229,11 +229,11 @@ def mutual_information(first: np.ndarray, second: np.ndarray) -> float:
 
 def information_gap(information: np.ndarray) -> np.ndarray:
     """
-    How much more the best block knows of each factor than the second best (Chen et al. 2018, Eq. 6, for blocks:
-    https://arxiv.org/abs/1802.04942).
+    The mutual information gap: the information about each factor in the best block minus that in the second best (Chen et al.
+    2018, Eq. 6, for blocks: https://arxiv.org/abs/1802.04942).
 
     :param information: normalised by each factor's entropy, (K, F)
-    :return: (F,); NaN where there is one block
+    :return: (F,); NaN if there is only one block
     """
     if len(information) < 2:
         return np.full(information.shape[1], np.nan)
@@ -255,8 +255,8 @@ def effective_rank(values: np.ndarray, size: float = 0.0) -> float:
     exp of the entropy of the normalised singular values (Roy and Vetterli 2007).
 
     :param values: singular values, ≥ 0
-    :param size: of the states; values that are rounding beside it do not count
-    :return: in [1, len(values)]; 0 where there is nothing
+    :param size: size of the states; values that are rounding relative to it are ignored
+    :return: in [1, len(values)]; 0 if no value is left
     """
     counted = values[values > ROUNDING * size]
     if not counted.sum():

@@ -1,6 +1,6 @@
 """
-Pictures of a diagnosis, at 6×4 inches. They need no display, and matplotlib's ``pyplot`` is not used, so that nothing has to
-be closed.
+Figures of the diagnostics, at 6×4 inches. They need no display, and do not use matplotlib's ``pyplot``, so they need not be
+closed.
 """
 
 import pathlib
@@ -24,17 +24,17 @@ __all__ = ["all_pictures", "latent_figure", "write_pictures"]
 
 DPI = 150
 MAX_COORDINATES = 6  # of a block, in one panel
-MAX_NUMBERS = 36  # in a heat map
-MAX_NUMBER_COLUMNS = 6  # of one: else they run into each other
-PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # in place of powers of ten
-MAX_LETTERS = 72  # beside each other at the foot of a figure
+MAX_NUMBERS = 36  # printed in a heat map
+MAX_NUMBER_COLUMNS = 6  # with more, the numbers would overlap
+PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # instead of powers of ten
+MAX_LETTERS = 72  # of horizontal tick labels at the bottom of a figure
 
 
 def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequence[str] = ()) -> dict[str, Figure]:
     """
-    :param diagnostics: of :func:`~sb3_eqr.visualize.diagnostics.diagnose`
+    :param diagnostics: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
     :param actions: names of the actions, (A,)
-    :param factors: names of the true factors, (F,), where known
+    :param factors: names of the true factors, (F,), if known
     :return: name of the file without suffix -> figure
     """
     with settings():
@@ -49,14 +49,14 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
 
 
 def write_pictures(figures: dict[str, Figure], folder: pathlib.Path) -> None:
-    """Each figure as PNG, written beside its place and renamed."""
+    """Write each figure as PNG, to a temporary file that is renamed."""
     for name, figure in figures.items():
         with atomic_write(folder / f"{name}.png", "png") as file, settings():
             figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
 
 
 def transition_figure(diagnostics: Diagnostics) -> Figure:
-    """Errors of the rollout per step ahead beside those of knowing nothing and of standing still."""
+    """Errors of the rollout per step ahead, compared with those of shuffled targets and of standing still."""
     figure = Figure(figsize=SIZE, layout="constrained")
     left, right = figure.subplots(1, 2)
     _errors(left, diagnostics.transition, "of latent states x̂, x")
@@ -69,7 +69,7 @@ def transition_figure(diagnostics: Diagnostics) -> Figure:
 
 
 def _errors(ax: Axes, errors: Transition, title: str) -> None:
-    named = {"predicted": errors.error, "shuffled (knows nothing)": errors.shuffled, "standing still": errors.still}
+    named = {"predicted": errors.error, "shuffled targets": errors.shuffled, "standing still": errors.still}
     _lines(ax, named)
     ax.set_title(title, loc="left")
     if max(np.nanmax(values, initial=0) for values in named.values()) > 0:
@@ -88,7 +88,7 @@ def _lines(ax: Axes, named: dict[str, np.ndarray]) -> None:
 
 
 def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
-    """How far each action moves each block: as predicted in every state, and as observed where it was played."""
+    """How far each action moves each block: as predicted in every state, and as observed where it was taken."""
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     top = max(np.nanmax(values, initial=0) for values in diagnostics.motion) or 1.0  # one scale for both
@@ -103,7 +103,7 @@ def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
 
 
 def _heat_map(ax: Axes, values: np.ndarray, title: str, top: float) -> AxesImage:
-    ax.set_facecolor("#dddddd")  # where nothing is known
+    ax.set_facecolor("#dddddd")  # for NaN
     image = ax.imshow(np.ma.masked_invalid(values), cmap="viridis", aspect="auto", interpolation="nearest", vmin=0, vmax=top)
     if values.size <= MAX_NUMBERS and values.shape[1] <= MAX_NUMBER_COLUMNS:
         for (row, column), value in np.ndenumerate(values):
@@ -140,7 +140,7 @@ def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figur
         ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
     figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn) if len(drawn) < 5 else 3)
     figure.supylabel("coordinate: radians, or latent units", fontsize=9)
-    part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks: those it moves most)"
+    part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks, those it moves most)"
     figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
     return figure
 
@@ -169,7 +169,7 @@ def _generator(ax: Axes, part: Generators, k: int, drawn: dict[str, Any]) -> Non
 
 
 def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()) -> Figure:
-    """Correlation between blocks, and where the true factors are known what each block knows of them."""
+    """Correlation between blocks and, if the true factors are known, each block's information about them."""
     found = diagnostics.disentanglement
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = figure.subplots(1, 1 if found.information is None else 2, squeeze=False)[0]
@@ -179,11 +179,11 @@ def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()
     axes[0].set_ylabel("block")
     if found.information is not None:
         names = factor_names(found.information.shape[1], factors)
-        _heat_map(axes[1], found.information.T, "information on true factors", 1)
+        _heat_map(axes[1], found.information.T, "information about true factors", 1)
         _block_ticks(axes[1], diagnostics.blocks)
         axes[1].set_yticks(range(len(names)), names)
     bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
-    bar.set_label("0: independent, 1: one says all of the other")
+    bar.set_label("0: independent, 1: one determines the other")
     return figure
 
 
@@ -192,7 +192,7 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
     found = diagnostics.collapse
     figure = Figure(figsize=SIZE, layout="constrained")
     ax = figure.subplots()
-    seen = found.spectrum[found.spectrum > found.spectrum[0] * ROUNDING]  # below, there is nothing but rounding
+    seen = found.spectrum[found.spectrum > found.spectrum[0] * ROUNDING]  # the rest is rounding
     seen = seen if len(seen) else found.spectrum
     ax.plot(np.arange(1, len(seen) + 1), seen, color=COLORS[0], marker="o", markersize=3, linewidth=1)
     ax.axvline(
@@ -202,7 +202,7 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         label=f"effective rank {found.effective_rank:.1f} of {found.dimensions}",
     )
     more = len(found.spectrum) - len(seen)
-    ax.set(xlabel=f"principal axis{f' ({more} more are 0 but for rounding)' if more else ''}", ylabel="standard deviation")
+    ax.set(xlabel=f"principal axis{f' ({more} more are 0 up to rounding)' if more else ''}", ylabel="standard deviation")
     ax.set_xlim(0, len(seen) + 1)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if seen[0] > 0:
@@ -211,20 +211,20 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
     ax.set_title(
-        f"Spectrum of the latent states: they spread by {found.spread:.1%} of their size;\n"
-        f"{found.dead_units:.0%} of the trunk's {found.n_units} units dead, {found.dormant_units:.0%} dormant",
+        f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n"
+        f"{found.dead_units:.0%} of the trunk's {found.n_units} units are dead, {found.dormant_units:.0%} dormant",
         loc="left",
     )
     return figure
 
 
 def has_rewards(diagnostics: Diagnostics) -> bool:
-    """Whether the reward predictor was trained and any reward varies."""
+    """:return: whether the reward predictor was trained and rewards vary"""
     return diagnostics.rewards_trained and not np.isnan(diagnostics.rewards.explained).all()
 
 
 def rewards_figure(diagnostics: Diagnostics) -> Figure:
-    """Error of the predicted reward per step ahead beside that of the mean reward."""
+    """Error of the predicted reward per step ahead, compared with that of the mean reward."""
     found = diagnostics.rewards
     figure = Figure(figsize=SIZE, layout="constrained")
     left, right = figure.subplots(1, 2)

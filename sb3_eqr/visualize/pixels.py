@@ -1,4 +1,4 @@
-"""What an agent sees, as pictures."""
+"""Observations as images."""
 
 import colorsys
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-ROW, HALF = 22, 170  # height of a bar and of its room, and half the width of a picture, in pixels
+ROW, HALF = 22, 170  # height of a row with a bar, and half the width of an image, in pixels
 MAX_ROWS = 16
 BAR, MIDDLE = (20, 70, 160), (160, 160, 160)
 
@@ -15,10 +15,10 @@ BAR, MIDDLE = (20, 70, 160), (160, 160, 160)
 def observed_pictures(observations: Any, space: spaces.Space, frame_stack: int) -> list[np.ndarray]:
     """
     :param observations: (T, *obs_shape), or a dict of these
-    :param space: of the observations
-    :param frame_stack: how many frames are stacked along the first axis of an image
-    :return: T of (height, width, 3), uint8: of a stack of frames the newest, planes that are no colours in colours of their
-        own, of numbers a bar each; of a dict the first image
+    :param space: observation space
+    :param frame_stack: number of frames stacked along the first axis of an image
+    :return: T of (height, width, 3), uint8: the newest of stacked frames; planes other than RGB each in their own colour;
+        numbers as bars; of a dict the first image
     """
     if isinstance(space, spaces.Dict):
         images = [key for key, part in space.spaces.items() if part.shape is not None and len(part.shape) == 3]
@@ -39,9 +39,9 @@ def observed_pictures(observations: Any, space: spaces.Space, frame_stack: int) 
 
 def bars(values: np.ndarray) -> list[np.ndarray]:
     """
-    Numbers as bars from 0, in the middle, each on a scale of its own that stays the same.
+    Numbers as bars that start at 0, in the middle, each with its own fixed scale.
 
-    :param values: (T, n), of which the first are shown
+    :param values: (T, n), only the first :data:`MAX_ROWS` of n are shown
     :return: T of (height, width, 3), uint8
     """
     shown = values[:, :MAX_ROWS]

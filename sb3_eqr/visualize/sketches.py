@@ -1,4 +1,4 @@
-"""Blocks of latent states as what can be drawn of them in a square panel: numbers only, no drawing."""
+"""Convert blocks of latent states to coordinates in a square panel, without drawing."""
 
 from typing import NamedTuple
 
@@ -9,36 +9,36 @@ from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, NoGroup
 from sb3_eqr.visualize.latents import frame, split
 
-ARROW = 0.4  # length of a unit arrow that stands on a dot, in half panels
-ROOM = 0.85  # how far into the panel the outermost thing reaches
-GHOST_ROOM = 3.0  # a panel grows for its predictions if that takes at most so many times what the truth needs
-# How three dimensions are seen: from 60° to the left and 25° above, as matplotlib does. (3, 2)
+ARROW = 0.4  # length of a unit arrow that starts at a dot, in half panels
+ROOM = 0.85  # the largest coordinate, in half panels
+GHOST_ROOM = 3.0  # a panel grows for its predictions, up to this multiple of what the true states need
+# Projection of three dimensions: from 60° to the left and 25° above, as in matplotlib. (3, 2)
 VIEW = np.array([[0.866, -0.211], [0.5, 0.366], [0.0, 0.906]])
 
 
 class Shape(NamedTuple):
-    """A block at T moments. In a panel's units: its edges are at ±1, x to the right, y up. NaN where there is nothing."""
+    """A block at T steps, in units of the panel: edges at ±1, x to the right, y up. NaN where there is no prediction."""
 
-    arrows: np.ndarray | None  # (T, A, 2): where the unit vectors go, seen from the dot
+    arrows: np.ndarray | None  # (T, A, 2): images of the unit vectors, relative to the dot
     dots: np.ndarray | None  # (T, 2): translation
 
 
 class Panel(NamedTuple):
-    """One block over the whole video, in units that stay the same all along."""
+    """One block over the full video, in constant units."""
 
     name: str
-    kind: str  # "arrow", "parallelogram", "axes", or "dot" where nothing turns
+    kind: str  # "arrow", "parallelogram", "axes", or "dot" if there is no rotation
     truth: Shape
     ghost: Shape
-    half_width: float | None  # of the panel, in latent units; None where lengths mean nothing
+    half_width: float | None  # of the panel, in latent units; None if lengths are meaningless
 
 
 def panels(model: EqRAlgorithm, states: th.Tensor, ghosts: th.Tensor, limit: int) -> list[Panel]:
     """
-    :param model: whose latents these are
-    :param states: x₀ of T moments, (T, D)
-    :param ghosts: what was predicted for them, (T, D); NaN where nothing was
-    :param limit: how many blocks at most
+    :param model: the agent
+    :param states: x₀ at T steps, (T, D)
+    :param ghosts: predictions of them, (T, D); NaN where there is none
+    :param limit: maximum number of blocks
     :return: one panel per block, in order
     """
     found: list[Panel] = []
@@ -52,8 +52,8 @@ def panels(model: EqRAlgorithm, states: th.Tensor, ghosts: th.Tensor, limit: int
 
 def panel(name: str, group: Group, truth: th.Tensor, ghost: th.Tensor) -> Panel:
     """
-    :param name: of the block
-    :param group: of the block
+    :param name: name of the block
+    :param group: group of the block
     :param truth: (T, *element_shape)
     :param ghost: (T, *element_shape)
     """
@@ -71,7 +71,7 @@ def panel(name: str, group: Group, truth: th.Tensor, ghost: th.Tensor) -> Panel:
     if dots is not None:
         assert ghost_dots is not None
         centre = (dots.min(axis=0) + dots.max(axis=0)) / 2
-        room = ROOM if arrows is None else 1 - ARROW  # an arrow stands on the outermost dot
+        room = ROOM if arrows is None else 1 - ARROW  # leaves space for an arrow at the outermost dot
         half_width = _extent(np.abs(dots - centre), np.abs(ghost_dots - centre)) / room
         dot_scale = 1 / half_width
     scaled = [
@@ -86,17 +86,17 @@ def panel(name: str, group: Group, truth: th.Tensor, ghost: th.Tensor) -> Panel:
 
 def in_plane(group: Group, elements: th.Tensor, axes: tuple[np.ndarray, np.ndarray] | None = None) -> Shape:
     """
-    Elements as arrows and dots, in latent units. A plane's rotation is one arrow, its first column; any other 2×2 matrix
-    both columns; three dimensions are seen from aside; of more the first two coordinates are.
+    Elements as arrows and dots, in latent units. A rotation of the plane is one arrow, its first column; any other 2×2 matrix
+    is both columns; three dimensions are projected; of more dimensions only the first two coordinates are shown.
 
-    :param group: of the elements
+    :param group: group of the elements
     :param elements: (T, *element_shape)
-    :param axes: mean, (n,), and two directions, (n, 2), to see a vector by
+    :param axes: mean, (n,), and two directions, (n, 2), to project a vector onto
     """
     matrix, vector = frame(group, elements)
     arrows = dots = None
-    if matrix is not None and not (isinstance(group, SE) and matrix.shape[-1] == 1):  # nothing turns in one dimension
-        columns = matrix.mT.double().numpy()  # (T, n, n): row i is where the i-th unit vector goes
+    if matrix is not None and not (isinstance(group, SE) and matrix.shape[-1] == 1):  # no rotation in one dimension
+        columns = matrix.mT.double().numpy()  # (T, n, n): row i is the image of the i-th unit vector
         arrows = _seen(columns)[:, : 1 if isinstance(group, (SO, SE)) and columns.shape[-1] == 2 else 3]
     if vector is not None:
         values = vector.double().numpy()
@@ -124,7 +124,7 @@ def _principal_axes(vectors: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _extent(truth: np.ndarray, ghost: np.ndarray) -> float:
-    """The half width that truth needs, or nearly all ghosts, unless they are too wild to be worth it."""
+    """:return: the half width that the true states need, or 98 % of the predictions, unless these are too far out"""
     needed = max(float(truth.max()), 1e-6)
     found = ghost[np.isfinite(ghost)]
     wanted = float(np.quantile(found, 0.98)) if len(found) > 0 else 0.0

@@ -1,4 +1,4 @@
-"""The numbers of a diagnosis as tables, one CSV file each."""
+"""The diagnostics as tables, one CSV file each."""
 
 import pathlib
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from sb3_eqr.visualize.measures import mean_of_known
 
 def all_tables(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequence[str] = ()) -> dict[str, pd.DataFrame]:
     """
-    :param diagnostics: of :func:`~sb3_eqr.visualize.diagnostics.diagnose`
+    :param diagnostics: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
     :param actions: names of the actions, (A,)
-    :param factors: names of the true factors, (F,), where known
-    :return: name of the file without suffix -> table; the order of the columns stays, new ones come last
+    :param factors: names of the true factors, (F,), if known
+    :return: name of the file without suffix -> table; the order of columns is stable, new ones are added at the end
     """
     return {
         "transition": _transition(diagnostics),
@@ -35,7 +35,7 @@ def all_tables(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequen
 
 
 def write_tables(tables: dict[str, pd.DataFrame], folder: pathlib.Path) -> None:
-    """Each table as CSV, written beside its place and renamed."""
+    """Write each table as CSV, to a temporary file that is renamed."""
     for name, table in tables.items():
         with atomic_write(folder / f"{name}.csv", "csv") as file:
             table.to_csv(file, index=False)
@@ -104,7 +104,7 @@ def _disentanglement(diagnostics: Diagnostics, actions: Sequence[str], factors: 
 
 def factor_names(n_factors: int, names: Sequence[str]) -> list[str]:
     """
-    :return: the names where there are as many, else numbers
+    :return: the names if their number is right, or else numbers
     """
     return list(names) if len(names) == n_factors else [f"factor {i}" for i in range(n_factors)]
 

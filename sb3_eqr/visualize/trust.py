@@ -1,4 +1,4 @@
-"""What RL Zoo writes beside a model, looked at before anything in it can run."""
+"""Check the files that RL Zoo writes next to a model, before any code that they name can run."""
 
 import ast
 import pathlib
@@ -9,9 +9,9 @@ from typing import Any
 import yaml
 
 PASS_TRUST = "If you know where the file comes from, pass --trust."
-# Modules whose classes and functions a file may name.
+# A file may name classes and functions of these modules.
 WRAPPERS = ("sb3_eqr.", "stable_baselines3.", "sb3_contrib.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
-# Of these alone the statistics of VecNormalize are made. numpy has moved its private modules from core to _core.
+# The only names in the statistics of VecNormalize. NumPy has moved its private modules from core to _core.
 STATISTICS = {
     "stable_baselines3.common.vec_env.vec_normalize": ("VecNormalize",),
     "stable_baselines3.common.running_mean_std": ("RunningMeanStd",),
@@ -31,7 +31,7 @@ STATISTICS["numpy.random.bit_generator"] = ("__pyx_unpickle_SeedSequence", "Seed
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML of plain values, and the ordered dictionaries and tuples that RL Zoo writes."""
+    """Loads plain values, and the ordered dictionaries and tuples that RL Zoo writes."""
 
 
 def _ordered(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
@@ -44,7 +44,7 @@ _PlainLoader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, no
 
 
 class _Statistics(pickle.Unpickler):
-    """Makes what ``STATISTICS`` names and nothing else."""
+    """Creates only objects that ``STATISTICS`` names."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name not in STATISTICS.get(module, ()):
@@ -56,21 +56,21 @@ def read_plain(path: pathlib.Path) -> dict[str, Any]:
     """
     :param path: a YAML file of RL Zoo
     :return: its contents
-    :raises ValueError: if it names Python objects, or is something else
+    :raises ValueError: if it names Python objects, or is not a mapping
     """
     try:
         found = yaml.load(path.read_text(encoding="utf-8"), Loader=_PlainLoader)
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: it must hold plain values, got: {' '.join(str(error).split())}. {PASS_TRUST}") from error
+        raise ValueError(f"{path} must contain plain values, got: {' '.join(str(error).split())}. {PASS_TRUST}") from error
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: it must hold names and values, got {found!r:.60}.")
+        raise ValueError(f"{path} must be a mapping, got {found!r:.60}.")
     return found
 
 
 def check_zoo_folder(folder: pathlib.Path) -> None:
     """
-    :param folder: with args.yml and config.yml of RL Zoo
-    :raises ValueError: if making the environment by them would import or evaluate what is not of the packages of ``WRAPPERS``
+    :param folder: folder with RL Zoo's args.yml and config.yml
+    :raises ValueError: if creating the environment from them would import or evaluate code outside ``WRAPPERS``
     """
     arguments, config = read_plain(folder / "args.yml"), read_plain(folder / "config.yml")
     named = [*(arguments.get("gym_packages") or []), *([arguments["env"]] if ":" in str(arguments.get("env")) else [])]
@@ -83,28 +83,26 @@ def check_zoo_folder(folder: pathlib.Path) -> None:
         except (ValueError, SyntaxError):
             named.append(normalize)
     if named:
-        raise ValueError(
-            f"{folder}: it must name nothing but wrappers of {WRAPPERS}, got {', '.join(map(str, named))}. {PASS_TRUST}"
-        )
+        raise ValueError(f"{folder} must name only wrappers of {WRAPPERS}, got {', '.join(map(str, named))}. {PASS_TRUST}")
     check_statistics(folder / "vecnormalize.pkl")
 
 
 def check_statistics(path: pathlib.Path) -> None:
     """
-    :param path: what VecNormalize's ``save`` wrote, or nothing
-    :raises ValueError: if it holds anything but numbers and spaces
+    :param path: file written by VecNormalize's ``save``; may not exist
+    :raises ValueError: if it contains anything but numbers and spaces
     """
     if not path.is_file():
         return
     try:
         with open(path, "rb") as file:
             _Statistics(file).load()
-    except Exception as error:  # of a damaged pickle, any
-        raise ValueError(f"{path}: it must hold the statistics of VecNormalize alone, got: {error}. {PASS_TRUST}") from error
+    except Exception as error:  # a damaged pickle may raise anything
+        raise ValueError(f"{path} must contain only statistics of VecNormalize, got: {error}. {PASS_TRUST}") from error
 
 
 def _names(wrappers: Any) -> list[str]:
-    """The names in RL Zoo's notation: a name, a dictionary with one key, or a list of these."""
+    """:return: the names in RL Zoo's notation: a name, a dictionary with one key, or a list of these"""
     if wrappers is None:
         return []
     if isinstance(wrappers, (list, tuple)):

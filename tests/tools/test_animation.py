@@ -1,4 +1,4 @@
-"""Videos of latent states, and the callback that logs them: what is drawn, apart from the drawing."""
+"""Videos of latent states, and the callback that logs them: mostly what is drawn, not how."""
 
 import gymnasium as gym
 import imageio.v2 as imageio
@@ -30,13 +30,13 @@ def rotation(angle):
 
 
 def elements(name, n=7):
-    """Elements of a group, (n, ...), with all parameters drawn."""
+    """Elements of a group with random parameters, (n, ...)."""
     group = make_group(name)
     return group, group.element(th.randn(n, group.num_params, generator=th.Generator().manual_seed(0)))
 
 
-def test_an_arrow_turns_with_the_rotation():
-    """SO(2)'s element for the angle θ takes (1, 0) to (cos θ, -sin θ), by the group's convention."""
+def test_an_arrow_shows_the_rotation():
+    """The element of SO(2) with the angle θ maps (1, 0) to (cos θ, -sin θ)."""
     angles = np.linspace(-3, 3, 13)
     group = make_group("SO(2)")
     shape = in_plane(group, group.element(th.as_tensor(angles)[:, None]))
@@ -44,7 +44,7 @@ def test_an_arrow_turns_with_the_rotation():
     np.testing.assert_allclose(np.arctan2(shape.arrows[:, 0, 1], shape.arrows[:, 0, 0]), -angles, atol=1e-6)
 
 
-def test_a_dot_stands_at_the_translation_and_its_arrow_is_the_rotation():
+def test_a_dot_shows_the_translation_and_its_arrow_the_rotation():
     group = make_group("SE(2)")
     shape = in_plane(group, group.element(th.tensor([[0.5, 3.0, -4.0]], dtype=th.float64)))
     np.testing.assert_allclose(shape.dots, [[3, -4]])
@@ -82,12 +82,12 @@ def test_every_group_is_drawn_inside_its_panel(name, n_arrows, has_dot, kind):
     assert np.abs(foot).max() <= 1 and np.abs(tips).max() <= 1 + 1e-9
     for truth, guess in zip(drawn.truth, drawn.ghost, strict=True):
         if truth is not None:
-            np.testing.assert_array_equal(guess[2:], truth[2:])  # one scale for both
+            np.testing.assert_array_equal(guess[2:], truth[2:])  # both have the same scale
             assert np.isnan(guess[:2]).all()
     Painter([drawn], np.zeros(len(found), int), 2, "").paint(1, np.zeros((4, 4, 3), np.uint8), Line(0, "a", 0, 0))
 
 
-def test_lengths_of_arrows_are_those_of_rotations():
+def test_arrows_of_rotations_have_a_fixed_length():
     _, found = elements("SO(2)")
     np.testing.assert_allclose(
         np.linalg.norm(panel("1", make_group("SO(2)"), found, found).truth.arrows, axis=-1), ROOM, rtol=1e-6
@@ -98,7 +98,7 @@ def test_lengths_of_arrows_are_those_of_rotations():
     )
 
 
-def test_a_panel_grows_for_predictions_but_not_for_wild_ones():
+def test_a_panel_grows_for_predictions_except_outliers():
     group = make_group("T(2)")
     truth = th.tensor([[-1.0, 0.0], [1.0, 0.0]])
     assert panel("1", group, truth, 2 * truth).half_width == pytest.approx(2 / ROOM, rel=0.1)
@@ -113,7 +113,7 @@ def test_without_a_group_two_principal_components_are_drawn():
 
 
 def rollout(model, state, actions):
-    """x̂ after some actions, by the paper's recursion alone: κ in eval mode moves the state again and again."""
+    """x̂ after some actions, with the paper's recursion: κ in eval mode is applied to the state for each action."""
     latent_model = model.policy.latent_model
     latent_model.eval()
     with th.no_grad():
@@ -126,15 +126,15 @@ def rollout(model, state, actions):
     return state
 
 
-def test_a_ghost_is_what_was_predicted_some_steps_before(make):
+def test_a_ghost_is_the_prediction_made_some_steps_before(make):
     model = make(ChainEnv(8))
-    model.exploration_rate = 1.0  # all actions
+    model.exploration_rate = 1.0  # random actions
     film = shoot(model, ChainEnv(8), STEPS, 0, False)
     states = encode(model, film.observations)
     ghosts = predictions(model, states, film.actions, film.starts, DEPTH)
     assert len(set(film.starts.tolist())) > 2  # several episodes
     for t in range(STEPS):
-        if t - film.starts[t] < DEPTH:  # also the first frames of the video
+        if t - film.starts[t] < DEPTH:  # includes the first frames of the video
             assert th.isnan(ghosts[t]).all()
         else:
             expected = rollout(model, states[t - DEPTH : t - DEPTH + 1], film.actions[t - DEPTH : t])
@@ -142,8 +142,8 @@ def test_a_ghost_is_what_was_predicted_some_steps_before(make):
 
 
 @EITHER
-def test_a_film_is_what_happened(make):
-    """The same play by hand."""
+def test_a_film_shows_what_happened(make):
+    """Compared with a loop over the environment."""
     model = make(ChainEnv(8))
     film = shoot(model, ChainEnv(8), STEPS, 3, True)
     env = DummyVecEnv([lambda: ChainEnv(8)])
@@ -160,7 +160,7 @@ def test_a_film_is_what_happened(make):
 
 @EITHER
 @pytest.mark.parametrize("group", ["SE(2)^2 x SO(3) x T(2)", None])
-def test_files_have_the_frames_and_generators_are_kept(make, group, tmp_path):
+def test_files_have_the_frames_and_the_global_generators_are_unchanged(make, group, tmp_path):
     model = make(ChainEnv(8), symmetry_coef=0, policy_kwargs={"group": group, "n_blocks": None})
     before = get_rng_state(model.action_space)
     paths = record(model, ChainEnv(8), tmp_path / "new" / "v1.5", 11, 3)
@@ -171,11 +171,11 @@ def test_files_have_the_frames_and_generators_are_kept(make, group, tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["v1.5.gif", "v1.5.mp4"]
     movie = imageio.get_reader(paths[0])
     assert movie.count_frames() == 11 and movie.get_data(10).shape == (HEIGHT, WIDTH, 3)
-    assert len(imageio.mimread(paths[1], memtest=False)) == 6  # every second one
+    assert len(imageio.mimread(paths[1], memtest=False)) == 6  # every second frame
 
 
 @EITHER
-def test_a_video_suffix_is_left_out(make, tmp_path):
+def test_a_video_suffix_is_removed(make, tmp_path):
     paths = record(make("CartPole-v1"), "CartPole-v1", tmp_path / "v.mp4", 7, 2, formats=("gif",))
     assert [path.name for path in paths] == ["v.gif"]
 
@@ -187,8 +187,8 @@ def test_blocks_are_numbered_from_zero(make):
 
 
 @pytest.mark.parametrize("name, letters", [("SO(3)", ["x", "y", "z"]), ("SE(3)", ["x", "y", "z"]), ("SE(2)", [])])
-def test_the_legend_is_of_what_is_drawn(name, letters):
-    """Axes have colours of their own."""
+def test_the_legend_matches_what_is_drawn(name, letters):
+    """Each axis has its own colour."""
     painter = Painter([panel("0", *elements(name), elements(name)[1])], np.zeros(7, int), 2, "about" * 99)
     (legend,) = painter.figure.legends
     said = {text.get_text(): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
@@ -199,7 +199,7 @@ def test_the_legend_is_of_what_is_drawn(name, letters):
 @EITHER
 def test_the_same_seed_draws_the_same_frames(make, tmp_path, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy")
-    model.exploration_rate = 1.0  # ε-greedy actions have a generator of their own
+    model.exploration_rate = 1.0  # ε-greedy actions use their own generator
     seen = []
     monkeypatch.setattr(animation, "write_video", lambda images, *_: seen.append(np.stack(list(images))))
     for seed in (0, 0, 1):
@@ -211,7 +211,7 @@ def test_the_same_seed_draws_the_same_frames(make, tmp_path, monkeypatch):
 
 
 @EITHER
-def test_the_game_is_rendered_where_it_can_be(make):
+def test_the_environment_is_rendered_if_possible(make):
     model = make("CartPole-v1")
     rendered = shoot(model, gym.make("CartPole-v1", render_mode="rgb_array"), 3, 0, True).pictures
     assert rendered[0].shape == (400, 600, 3)
@@ -221,7 +221,7 @@ def test_the_game_is_rendered_where_it_can_be(make):
 
 @EITHER
 def test_several_normalised_environments(make):
-    """The first is filmed, with the rewards that it gave."""
+    """The first environment is filmed, with its raw rewards."""
     env = VecNormalize(DummyVecEnv([lambda: ChainEnv(8), lambda: ChainEnv(8)]))
     model = make(env)
     plain = VecNormalize(DummyVecEnv([lambda: ChainEnv(8), lambda: ChainEnv(8)]), training=False)
@@ -231,7 +231,7 @@ def test_several_normalised_environments(make):
     assert film.rewards[0] == pytest.approx(alone.rewards[0], abs=1e-6)
 
 
-def test_what_an_agent_sees_as_a_picture():
+def test_observations_as_images():
     stack = np.arange(4, dtype=np.uint8)[None, :, None, None] * np.ones((2, 4, 5, 6), np.uint8)
     newest = observed_pictures(stack, spaces.Box(0, 255, (4, 5, 6), np.uint8), 4)
     assert len(newest) == 2 and newest[0].shape == (5, 6, 3) and (newest[0] == 3).all()
@@ -245,7 +245,7 @@ def test_what_an_agent_sees_as_a_picture():
 
 
 @EITHER
-def test_nothing_is_left_of_a_video_that_failed(make, tmp_path, monkeypatch):
+def test_a_failed_video_leaves_no_files(make, tmp_path, monkeypatch):
     model = make(ChainEnv(8))
     old = tmp_path / "v.gif"
     old.write_bytes(b"old")
@@ -263,20 +263,20 @@ def test_nothing_is_left_of_a_video_that_failed(make, tmp_path, monkeypatch):
 
 
 @EITHER
-def test_what_cannot_be_filmed_is_refused(make, tmp_path):
+def test_invalid_arguments_raise(make, tmp_path):
     model = make(ChainEnv(8))
-    with pytest.raises(ValueError, match="formats: expected some of"):
+    with pytest.raises(ValueError, match="formats must be one or more of"):
         record(model, ChainEnv(), tmp_path / "v", formats=("avi",))
     with pytest.raises(ValueError, match="n_steps must be an integer >= 6"):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
-    with pytest.raises(ValueError, match="env: expected the agent's observation_space"):
+    with pytest.raises(ValueError, match="env must have the agent's observation_space"):
         record(model, ImageEnv(), tmp_path / "v")
-    with pytest.raises(ValueError, match=r"record: expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN, which"):
+    with pytest.raises(ValueError, match=r"record needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which"):
         record(DQN("MlpPolicy", ChainEnv()), ChainEnv(), tmp_path / "v")
 
 
-def test_the_frame_shows_truth_and_ghost():
-    """Blue along the arrow, orange along the ghost's; without a ghost nothing is orange. A picture keeps its shape."""
+def test_a_frame_shows_truth_and_ghost():
+    """Blue along the arrow, orange along the ghost's; nothing is orange without a ghost. Images keep their aspect ratio."""
     truth = Shape(np.array([[[0.0, 0.85]]] * 2), None)
     ghost = Shape(np.array([[[np.nan, np.nan]], [[0.85, 0.0]]]), None)
     painter = Painter([Panel("1", "arrow", truth, ghost, None)], np.zeros(2, int), 1, "")
@@ -284,13 +284,13 @@ def test_the_frame_shows_truth_and_ghost():
     first, second = (painter.paint(t, picture, Line(t, "up", 0, 0)).astype(int) for t in (0, 1))
 
     def pixel(frame, x, y):
-        """At a place in the panel, whose edges are at ±1."""
+        """The colour at a position in the panel, whose edges are at ±1."""
         column, row = painter.axes[0].transData.transform((x, y))
         return frame[HEIGHT - round(row), round(column)]
 
     assert pixel(second, 0, 0.5)[2] > pixel(second, 0, 0.5)[0] + 50
     assert pixel(second, 0.5, 0)[0] > pixel(second, 0.5, 0)[2] + 50
-    assert not (first[:, 400:][..., 0] > first[:, 400:][..., 2] + 50)[60:-60].any()  # the legend has orange
+    assert not (first[:, 400:][..., 0] > first[:, 400:][..., 2] + 50)[60:-60].any()  # except in the legend
     green = (first == (0, 255, 0)).all(axis=2)
     assert green.any(axis=0).sum() == pytest.approx(2 * green.any(axis=1).sum(), abs=4)
 
@@ -313,7 +313,7 @@ def trained(make, callback, tmp_path=None, **kwargs):
 
 
 @EITHER
-def test_training_is_the_same_and_tensorboard_has_what_was_found(make, tmp_path):
+def test_the_callback_does_not_change_training_and_logs_to_tensorboard(make, tmp_path):
     plain = trained(make, None)
     watched = trained(make, LatentCallback(log_freq=15, n_windows=16), tmp_path)
     for (name, a), (_, b) in zip(plain.policy.state_dict().items(), watched.policy.state_dict().items(), strict=True):
@@ -328,7 +328,7 @@ def test_training_is_the_same_and_tensorboard_has_what_was_found(make, tmp_path)
 
 
 @EITHER
-def test_looking_leaves_the_networks_as_they_were(make):
+def test_the_callback_does_not_change_the_networks(make):
     callback = LatentCallback(log_freq=1000, n_windows=16)
     model = trained(make, callback)
     model.policy.set_training_mode(True)
@@ -342,25 +342,25 @@ def test_looking_leaves_the_networks_as_they_were(make):
 
 
 @EITHER
-def test_nothing_is_looked_at_before_a_window_is_complete(make, tmp_path, monkeypatch):
+def test_the_callback_waits_for_a_complete_window(make, tmp_path, monkeypatch):
     looks = []
     monkeypatch.setattr("sb3_eqr.visualize.callback.diagnose", lambda model, play: looks.append(play) or 1 / 0)
     every = LatentCallback(log_freq=1, n_windows=16)
     make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(1, callback=every)  # a window needs three steps
     assert not looks
-    with pytest.raises(ZeroDivisionError):  # it would have looked
+    with pytest.raises(ZeroDivisionError):  # this call evaluates
         make(ChainEnv(), tensorboard_log=str(tmp_path)).learn(9, callback=every)
     assert len(looks) == 1
 
 
 @EITHER
 @pytest.mark.parametrize("off", [{"prediction_depth": 0}, {"aet_coef": 0, "symmetry_coef": 0, "reward_coef": 0}])
-def test_an_agent_without_latent_losses_is_told_once(make, off):
-    with pytest.warns(UserWarning, match="there is nothing to look at") as told:
+def test_an_agent_without_latent_losses_warns_once(make, off):
+    with pytest.warns(UserWarning, match="LatentCallback logs nothing") as told:
         trained(make, LatentCallback(log_freq=10), **off)
     assert len([warning for warning in told if "LatentCallback" in str(warning.message)]) == 1
 
 
-def test_other_agents_are_refused():
-    with pytest.raises(ValueError, match=r"expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN"):
+def test_other_agents_raise():
+    with pytest.raises(ValueError, match=r"LatentCallback needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN"):
         DQN("MlpPolicy", ChainEnv()).learn(1, callback=LatentCallback())

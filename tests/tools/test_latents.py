@@ -107,7 +107,7 @@ def test_elements_that_are_no_matrices_are_vectors(n_blocks):
 def test_other_agents_are_refused():
     model = DQN("MlpPolicy", "CartPole-v1", device="cpu")
     windows = play(EqRQRDQN("MlpPolicy", "CartPole-v1", device="cpu"), "CartPole-v1", 40, depth=2)  # an id is enough
-    message = r"expected an EqR agent \(EqRQRDQN, EqRRainbow\), found DQN, which has no latent model"
+    message = r"needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which has no latent model"
     for look in (
         lambda: play(model, "CartPole-v1"),
         lambda: diagnose(model, windows),

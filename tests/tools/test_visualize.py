@@ -285,7 +285,7 @@ def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
 @pytest.mark.parametrize(
     "name, content, message",
     [
-        ("args.yml", "a: !!python/object/apply:os.getcwd []", "must hold plain values, got: .*Pass|pass --trust"),
+        ("args.yml", "a: !!python/object/apply:os.getcwd []", "must contain plain values, got: .*Pass|pass --trust"),
         ("args.yml", "env: Ring-v0\ngym_packages: [antigravity]", "got antigravity"),
         ("args.yml", "env: antigravity:Ring-v0", "got antigravity:Ring-v0"),
         ("config.yml", "env_wrapper: [{subprocess.run: {}}]", r"got subprocess\.run"),
@@ -309,7 +309,7 @@ def test_the_algorithm_is_in_the_file(tmp_path):
     make_model(EqRRainbow).save(tmp_path / "rainbow")
     assert loading.find_algorithm(tmp_path / "rainbow.zip") == "eqr_rainbow"
     QRDQN("MlpPolicy", Ring(), device="cpu").save(tmp_path / "stock")
-    with pytest.raises(ValueError, match=r"expected an agent of EqRQRDQN or EqRRainbow, found .*sb3_contrib\.qrdqn\.policies"):
+    with pytest.raises(ValueError, match=r"must be a saved EqRQRDQN or EqRRainbow, got .*sb3_contrib\.qrdqn\.policies"):
         loading.load_model(tmp_path / "stock.zip")
 
 
@@ -326,17 +326,17 @@ def saved(tmp_path_factory):
     "line, message",
     [
         ("", "the following arguments are required: MODEL"),
-        ("nothing.zip", "MODEL: expected the path of a .zip file, such as .*, found 'nothing.zip'"),
-        ("{cut}", "expected a whole file of an agent's save, found one that is truncated"),
-        ("{model}", r"--env: expected the environment of the agent, .* \(args.yml\) beside"),
+        ("nothing.zip", "MODEL must be the path of a .zip file, such as .*, got 'nothing.zip'"),
+        ("{cut}", "must be a file written by an agent's save, got a truncated file"),
+        ("{model}", r"--env must be the agent's environment, got none, and RL Zoo's args\.yml is not"),
         ("{model} --env Rnig-v0", "'Rnig-v0' is not registered with gymnasium. Did you mean 'Ring-v0'?"),
-        ("{model} --env CartPole-v1", "the environment is not the agent's. Observation spaces do not match"),
-        ("{model} --env Ring-v0 --env-kwargs unwound", "--env-kwargs: expected key:value, found 'unwound'"),
-        ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not take {'speed': 2}"),
+        ("{model} --env CartPole-v1", "--env does not have the agent's spaces. Observation spaces do not match"),
+        ("{model} --env Ring-v0 --env-kwargs unwound", "--env-kwargs must be key:value, got 'unwound'"),
+        ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not accept {'speed': 2}"),
         ("{model} --env Ring-v0 --steps 5", "visualize: --steps must be an integer >= 8, got 5"),
         ("{model} --env Ring-v0 --depth 0", "visualize: --depth must be an integer >= 1, got 0"),
         ("{model} --env Ring-v0 --n-envs 0", "--n-envs: expected at least 1, found 0"),
-        ("{model} --env ALE/Pong-v5 --env-kwargs mode:1", "--env-kwargs: expected none for Atari"),
+        ("{model} --env ALE/Pong-v5 --env-kwargs mode:1", "--env-kwargs must be empty for Atari"),
         ("{model} --algo dqn", "invalid choice: 'dqn'"),
     ],
 )
