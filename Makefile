@@ -2,20 +2,23 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
-GAME ?= Pong
+GAME ?=
 CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
+DEMO = OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" SDL_VIDEODRIVER=dummy $(BIN)/python examples/demo.py
 
 .PHONY: demo quick test pytest slow format lint type commit-checks doc dist clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
+# CartPole, which is learned in two minutes, then a game; `make demo GAME=Boxing` is the game alone.
 demo: $(VENV)/installed
-	OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" $(BIN)/python examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
+	$(if $(GAME),,$(DEMO) --game CartPole-v1)
+	$(DEMO) --game "$(or $(GAME),Pong)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
 
 test: lint type pytest
 

@@ -1,32 +1,38 @@
 """
-An EqR agent on one Atari game, from training to a plot and a video of what it observes and predicts.
+An EqR agent on one environment, from training to a plot and a video of what it observes and predicts.
 
-    python examples/demo.py --game Pong                       # EqRQRDQN, as many steps as fit into --minutes
+    python examples/demo.py --game CartPole-v1                # EqRQRDQN, 15,000 steps: enough to learn it
+    python examples/demo.py --game Pong                       # as many steps as fit into --minutes
     python examples/demo.py --game Boxing --steps 100000      # the full benchmark
     python examples/demo.py --config eqr_rainbow --steps 3000
     python examples/demo.py --config eqr_bbf --width-scale 1 --steps 3000    # narrow enough for two cores
 
-Writes model.zip, progress.csv, training.png, latents.mp4 and latents.gif to --out. The video shows the game on the left, the
-blocks of the agent's latent state on the right: now, and as its latent model predicted them five steps before.
+Writes model.zip, progress.csv, training.png, latents.mp4 and latents.gif to --out, and prints what the latent states have
+learned. The video shows the environment on the left and the blocks of the agent's latent state on the right: now, and as its
+latent model predicted them five steps before.
 """
 
 import argparse
 import pathlib
 import time
 
+import gymnasium as gym
 import matplotlib
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.envs.atari import atari_env_id
-from sb3_eqr.visualize.animation import record
+from sb3_eqr.visualize import diagnose, play, record
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -39,6 +45,8 @@ LOSSES = {
     "train/reward_loss": "reward loss",
 }
 EVALUATION_SECONDS = 60  # kept free at the end of the minutes
+DIAGNOSIS_STEPS = 500
+CLASSIC_STEPS = 15_000  # of CartPole's entry
 ANIMATION_SECONDS = 15  # as well
 ANIMATION_STEPS = 200
 RESULTS = ("training.png", "latents.mp4", "latents.gif")
@@ -48,13 +56,13 @@ SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Ta
 
 
 class Demo(BaseCallback):
-    """Writes a row of metrics every so many steps, keeps the score of every game, stops when the time is over."""
+    """Writes a row of metrics every so many steps, keeps the score of every episode, stops when the time is over."""
 
     def __init__(self, log_every: int, seconds: float | None):
         super().__init__()
         self.log_every = log_every
         self.deadline = None if seconds is None else time.monotonic() + seconds
-        self.scores: list[tuple[int, float]] = []  # (step, raw score of a full game)
+        self.scores: list[tuple[int, float]] = []  # (step, raw score of a full episode)
 
     def _on_training_end(self) -> None:
         if self.deadline is not None and time.monotonic() >= self.deadline:
@@ -67,6 +75,18 @@ class Demo(BaseCallback):
         return self.deadline is None or time.monotonic() < self.deadline
 
 
+def is_atari(game: str) -> bool:
+    """Whether it is a game of ALE, rather than an environment of gymnasium with an entry of its own."""
+    return game not in gym.registry
+
+
+def make_env(game: str, n_envs: int = 1, seed: int = 0, training: bool = False, render_mode: str | None = None) -> VecEnv:
+    """The environment, preprocessed for its policy."""
+    if is_atari(game):
+        return make_atari100k_env(game, n_envs=n_envs, seed=seed, training=training, render_mode=render_mode)
+    return make_vec_env(game, n_envs, seed, env_kwargs={"render_mode": render_mode})
+
+
 def make_model(config: str, width_scale: float | None, game: str, seed: int, **changes) -> EqRAlgorithm:
     """
     :param config: a file in zoo_hyperparams
@@ -75,9 +95,10 @@ def make_model(config: str, width_scale: float | None, game: str, seed: int, **c
     if width_scale is not None:
         network = {"features_extractor_kwargs": {"width_scale": width_scale}, "net_arch": [round(512 * width_scale)]}
         changes["policy_kwargs"] = network
-    settings = load_configuration(config, **changes)
+    policy, entry = ("CnnPolicy", "atari") if is_atari(game) else ("MlpPolicy", game)
+    settings = load_configuration(config, entry, **changes)
     algorithm = EqRQRDQN if config == "eqr_qrdqn" else EqRRainbow
-    return algorithm("CnnPolicy", make_atari100k_env(game, seed=seed), seed=seed, **settings)
+    return algorithm(policy, make_env(game, seed=seed, training=True), seed=seed, **settings)
 
 
 def steps_that_fit(config: str, width_scale: float | None, game: str, seconds: float) -> int:
@@ -100,21 +121,20 @@ def draw(
     title: str,
     path: pathlib.Path,
 ) -> None:
-    """One figure: the score of every game, the evaluation at the end, and the four losses over steps."""
-    figure, axes = plt.subplots(5, 1, figsize=(7, 11), sharex=True, layout="constrained")
+    """One figure: the score of every episode, the evaluation at the end, and the losses over steps."""
+    shown = {key: name for key, name in LOSSES.items() if key in progress}  # no update, or a loss that is off: not there
+    figure, axes = plt.subplots(1 + len(shown), 1, figsize=(7, 3 + 2 * len(shown)), sharex=True, layout="constrained")
+    axes = np.atleast_1d(axes)
     figure.suptitle(title)
     steps, raw = np.array(scores).reshape(-1, 2).T
-    axes[0].plot(steps, raw, "o", color="0.6", markersize=4, label="games in training")
-    if "rollout/ep_rew_mean" in progress:  # not before the first game is over
-        means = progress.dropna(subset="rollout/ep_rew_mean")
-        axes[0].plot(means["time/total_timesteps"], means["rollout/ep_rew_mean"], color="C0", label="mean of the last 100")
+    axes[0].plot(steps, raw, "o", color="0.6", markersize=4, label="episodes in training")
+    axes[0].plot(steps, pd.Series(raw).rolling(10, min_periods=1).mean(), color="C0", label="mean of the last 10")
     axes[0].plot(progress["time/total_timesteps"].max(), evaluation, "*", color="C3", markersize=10, label="evaluation")
     axes[0].set_ylabel("raw score")
     axes[0].legend(loc="best", fontsize="small")
-    for axis, (key, name) in zip(axes[1:], LOSSES.items(), strict=True):
-        if key in progress:  # not before the first update
-            losses = progress.dropna(subset=key)
-            axis.plot(losses["time/total_timesteps"], losses[key], color="C1")
+    for axis, (key, name) in zip(axes[1:], shown.items(), strict=True):
+        losses = progress.dropna(subset=key)
+        axis.plot(losses["time/total_timesteps"], losses[key], color="C1")
         axis.set_ylabel(name)
         axis.set_ylim(bottom=0)
     axes[-1].set_xlabel("steps")
@@ -137,34 +157,43 @@ def draw(
 
 def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, float]], out: pathlib.Path) -> None:
     """
-    Evaluate, draw, film.
+    Evaluate, draw, film, diagnose.
 
-    :param scores: of the games in training, (step, raw score)
+    :param scores: of the episodes in training, (step, raw score)
     """
-    env = make_atari100k_env(args.game, n_envs=args.eval_episodes, seed=args.seed + 10_000, training=False)
-    found, _ = evaluate_policy(model, env, args.eval_episodes, return_episode_rewards=True)
-    print(f"score of {len(found)} games after {model.num_timesteps} steps: mean {np.mean(found):.1f}, each {found}")
+    env = make_env(args.game, args.eval_episodes, args.seed + 10_000)
+    with tqdm(total=args.eval_episodes, desc="evaluation", unit="episode") as bar:
+        found, _ = evaluate_policy(
+            model,
+            env,
+            args.eval_episodes,
+            callback=lambda here, _: bar.update(int(here["done"])),
+            return_episode_rewards=True,
+        )
+    assert isinstance(found, list)
+    print(f"score of {len(found)} episodes after {model.num_timesteps} steps: mean {np.mean(found):.1f}, each {found}")
     title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
     progress = pd.read_csv(out / "progress.csv")
     draw(progress, scores, float(np.mean(found)), model.learning_starts, title, out / "training.png")
-    env = make_atari100k_env(args.game, training=False, render_mode="rgb_array")
-    # As it explores: without noise a young agent holds one button down.
+    env = make_env(args.game, render_mode="rgb_array")
+    # As it explores: without noise a young agent repeats one action.
     record(model, env, out / "latents", ANIMATION_STEPS, seed=args.seed + 20_000, deterministic=False)
+    print(diagnose(model, play(model, env, DIAGNOSIS_STEPS, seed=args.seed + 30_000)).summary)
 
 
 def main() -> None:
-    """Train, save, evaluate, draw, film."""
+    """Train, save, evaluate, draw, film, diagnose."""
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--game", default="Pong", help="any of ALE's games")
+    parser.add_argument("--game", default="Pong", help="any of ALE's games, or CartPole-v1")
     parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn", help="see docs/configurations.md")
     parser.add_argument(
         "--width-scale", type=float, help="of eqr_bbf, whose head gets 512 times as wide; 4 in its paper, 1 fits two cores"
     )
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
     parser.add_argument("--minutes", type=float, default=5.5, help="for everything, where --steps is not given")
-    parser.add_argument("--eval-episodes", type=int, default=3, help="games at the end")
+    parser.add_argument("--eval-episodes", type=int, default=3, help="episodes at the end")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument(
         "--out",
@@ -175,11 +204,13 @@ def main() -> None:
     args = parser.parse_args()
     if args.width_scale is not None and args.config != "eqr_bbf":
         parser.error(f"--width-scale: expected --config eqr_bbf, whose networks have a width, found {args.config}")
-    game = atari_env_id(args.game)[4:-3]
+    game = atari_env_id(args.game)[4:-3] if is_atari(args.game) else args.game
     out = args.out or pathlib.Path("demo_results") / (game if args.config == "eqr_qrdqn" else f"{game}-{args.config}")
     settings: dict = {}
     seconds, start = None, time.monotonic()
-    if args.steps is None:
+    if not is_atari(game):
+        args.steps = args.steps or CLASSIC_STEPS
+    elif args.steps is None:
         seconds = args.minutes * 60 - EVALUATION_SECONDS - ANIMATION_SECONDS
         args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}

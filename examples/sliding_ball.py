@@ -174,7 +174,14 @@ def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> 
     world = SlidingBall(dimensions=DIMENSIONS[world_name])
     env = make_vec_env(IDS[world_name], N_ENVS, seed)
     model = train_representation(
-        env, "SO(2)", n_blocks=world.dimensions, total_timesteps=steps, seed=seed, device="cpu", **ARMS[arm]
+        env,
+        "SO(2)",
+        n_blocks=world.dimensions,
+        total_timesteps=steps,
+        progress_bar=True,
+        seed=seed,
+        device="cpu",
+        **ARMS[arm],
     )
     name = f"{world_name}-{arm}-{seed}".replace(", ", "-").replace(" ", "_")
     model.save(out / name)

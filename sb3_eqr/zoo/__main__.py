@@ -181,7 +181,10 @@ def check_trained(args: argparse.Namespace) -> None:
             args.load_last_checkpoint,
         )
     except (AssertionError, ValueError) as error:
-        fail(f"{error}. Pass -f with the folder given to train (logs by default), or train one first.")
+        runs = pathlib.Path(args.folder, args.algo or "ppo").glob(f"{EnvironmentName(args.env)}_*/*.zip")
+        ids = sorted({int(run.parent.name.rpartition("_")[2]) for run in runs})
+        found = f" There are models in {' and '.join(map(str, ids))}: pass --exp-id." if ids else ""
+        fail(f"{error}.{found} Pass -f with the folder given to train (logs by default), or train one first.")
 
 
 def save_where_nothing_is_shown(command: str) -> None:

@@ -178,6 +178,15 @@ def test_an_environment_without_an_entry_trains_by_the_one_for_its_observations(
     assert model._n_updates > 0 and policy in (folder / env_id / "config.yml").read_text()
 
 
+def test_a_run_without_a_model_names_those_with_one(sb3_eqr, capfd, tmp_path):
+    for run, name in ((1, "CartPole-v1.zip"), (3, "best_model.zip"), (4, "notes.txt")):
+        (tmp_path / "eqr_qrdqn" / f"CartPole-v1_{run}").mkdir(parents=True)
+        (tmp_path / "eqr_qrdqn" / f"CartPole-v1_{run}" / name).touch()
+    with pytest.raises(SystemExit):
+        sb3_eqr(f"push_to_hub --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path} --dry-run")
+    assert "There are models in 1 and 3: pass --exp-id." in capfd.readouterr().err
+
+
 def test_other_agents_pass(sb3_eqr, tmp_path):
     """Policies that we do not know, and files that RL Zoo brings."""
     own = {
