@@ -1,4 +1,4 @@
-# `make demo` and `make test` need Python (3.11 or newer) and make, and nothing before them.
+# `make demo` and `make test` need only Python (3.11 or newer) and make; they create the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
@@ -22,7 +22,7 @@ demo: $(VENV)/installed
 
 test: lint type pytest
 
-# The inner loop: groups, losses, layers, latent model, sum tree, buffers.
+# Fast unit tests: groups, losses, layers, latent model, sum tree, buffers.
 quick: $(VENV)/installed
 	$(BIN)/python -m pytest tests/unit
 
@@ -49,7 +49,7 @@ commit-checks: format lint type
 doc: $(VENV)/installed
 	$(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
 
-# A release: what a wheel and a source archive hold, and whether the wheel works in an environment that has nothing else.
+# For a release: build a wheel and a source archive, and check that the wheel works in an empty environment.
 dist: $(VENV)/installed
 	rm -rf dist
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
@@ -58,7 +58,7 @@ dist: $(VENV)/installed
 	$(PYTHON) -m venv dist/venv
 	dist/venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
 	cd dist && venv/bin/python -c "from sb3_eqr import EqRQRDQN; EqRQRDQN('MlpPolicy', 'CartPole-v1', learning_starts=50).learn(100)"
-	@echo "Then: CHANGELOG.md has the version, make slow passes, docs/results are of this version, tag it."
+	@echo "Then check that CHANGELOG.md has the version, make slow passes, and docs/results are of this version, and tag it."
 
 clean:
 	rm -rf $(VENV) build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,1 +1,1 @@
-"""What is measured about the code itself, outside the wheel: run from the root of the repository."""
+"""Measurements of the code itself, which are not in the wheel: run them from the root of the repository."""

@@ -1,7 +1,7 @@
 """
-Attacks on the package: kills, wrong and hostile input, NaN, damaged files, a full disk, threads. Prints a row for each.
+Attacks on the package: kills, wrong and hostile input, NaN, damaged files, a full disk, threads. Prints a row per test.
 
-    python -m benchmarks.attack                       # all: about a quarter of an hour
+    python -m benchmarks.attack                       # all, about a quarter of an hour
     python -m benchmarks.attack --only inputs files --kills 20
     python -m benchmarks.attack --out docs/results/attack.md
 """
@@ -21,10 +21,10 @@ from benchmarks.attacks import Finding, command_lines, files, inputs, kills, num
 
 def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Callable[[], Finding]]]:
     """
-    :param folder: for what they write
-    :param n_kills: of each test that kills
-    :param seed: of moments and places
-    :return: by the name of ``--only``
+    :param folder: folder for temporary files
+    :param n_kills: number of kills per test that kills
+    :param seed: seed of the times of kills and places of damage
+    :return: tests by their name in ``--only``
     """
     rng = random.Random(seed)
     return {
@@ -49,13 +49,13 @@ def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Cal
 
 
 def main() -> None:
-    """The command line."""
+    """Parse the command line, run the tests, write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--only", nargs="+", choices=list(attacks(pathlib.Path(), 0, 0)), help="some of the parts (default: all)"
+        "--only", nargs="+", choices=list(attacks(pathlib.Path(), 0, 0)), help="a subset of the parts (default: all)"
     )
-    parser.add_argument("--kills", type=int, default=100, help="of each test that kills (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of moments and places (default: 0)")
+    parser.add_argument("--kills", type=int, default=100, help="number per test that kills (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of times and places (default: 0)")
     parser.add_argument("--out", type=pathlib.Path, help="a Markdown file for the table")
     args = parser.parse_args()
     th.set_num_threads(1)

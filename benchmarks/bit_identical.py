@@ -1,13 +1,13 @@
 """
-Does a change of the code leave every number of training as it was?
+Check that a change of the code leaves training bit-identical.
 
-Trains some thirty configurations for 200 updates and more each and hashes parameters, batch statistics, optimiser state,
+Trains about thirty configurations for 200 updates or more each, and hashes parameters, batch statistics, optimiser state,
 target copies, priorities and the random generators:
 
     python benchmarks/bit_identical.py --write docs/results/bit_identical.json    # before the change
     python benchmarks/bit_identical.py --check docs/results/bit_identical.json    # after it
 
-Hashes depend on the CPU and on the version of PyTorch: compare on one machine.
+Hashes depend on the CPU and the version of PyTorch: compare them on one machine.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup
 AGENTS = {"qrdqn": EqRQRDQN, "rainbow": EqRRainbow}
 COMMON: dict[str, Any] = {
     "learning_starts": 60,
-    "buffer_size": 150,  # the ring is overwritten
+    "buffer_size": 150,  # small, so that old transitions are overwritten
     "batch_size": 16,
     "n_steps": 3,
     "prediction_depth": 3,
@@ -47,14 +47,14 @@ SCALES = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
 
 
 def make_images() -> FakeImageEnv:
-    """Random images, the same ones each time: they are drawn by the observation space, which ``reset(seed)`` does not seed."""
+    """Reproducible random images: they are drawn by the observation space, which ``reset(seed)`` does not seed."""
     env = FakeImageEnv(4, 40, 40, n_channels=1, discrete=True)
     env.observation_space.seed(0)
     return env
 
 
 def make_env(kind: str, n_envs: int) -> VecEnv:
-    """A few environments of one kind, made alike each time."""
+    """Create environments of one kind, the same each time."""
     np.random.seed(0)
     if kind == "images":
         return VecFrameStack(make_vec_env(make_images, n_envs), 4)
@@ -155,8 +155,8 @@ CONFIGURATIONS: dict[str, Configuration] = {
 
 def train(name: str) -> Any:
     """
-    :param name: of a configuration
-    :return: its agent after some 200 updates
+    :param name: name of a configuration
+    :return: its agent after about 200 updates
     """
     agent, kind, n_envs, arguments, network = CONFIGURATIONS[name]
     arguments = {**COMMON, **arguments, "policy_kwargs": {**NETWORK, **network}}
@@ -183,7 +183,7 @@ def train(name: str) -> Any:
 
 
 def pieces(model: Any) -> Iterator[np.ndarray]:
-    """Every number that the updates leave behind."""
+    """All arrays that the updates change."""
     policy = model.policy
     for group in policy.optimizer.param_groups:
         for parameter in group["params"]:
@@ -203,8 +203,8 @@ def pieces(model: Any) -> Iterator[np.ndarray]:
 
 def digest(name: str) -> str:
     """
-    :param name: of a configuration
-    :return: SHA-256 of its numbers, the first 16 digits
+    :param name: name of a configuration
+    :return: the first 16 digits of the SHA-256 of these arrays
     """
     hashed = hashlib.sha256()
     for array in pieces(train(name)):
@@ -213,10 +213,10 @@ def digest(name: str) -> str:
 
 
 def main() -> None:
-    """Write the hashes, or compare with those of before."""
+    """Write the hashes, or compare them with earlier ones."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
-    parser.add_argument("--write", type=pathlib.Path, metavar="FILE", help="where the hashes go")
-    parser.add_argument("--check", type=pathlib.Path, metavar="FILE", help="hashes to compare with")
+    parser.add_argument("--write", type=pathlib.Path, metavar="FILE", help="file to write the hashes to")
+    parser.add_argument("--check", type=pathlib.Path, metavar="FILE", help="file of hashes to compare with")
     parser.add_argument("--only", nargs="+", choices=CONFIGURATIONS, default=list(CONFIGURATIONS), metavar="NAME")
     args = parser.parse_args()
     th.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Timing in turns, so that a machine that is slow for a while is slow for all that is compared; counting; tables."""
+"""Timing of alternating calls, so that slow periods of the machine affect all of them alike; counting; tables."""
 
 import resource
 import time
@@ -13,34 +13,34 @@ from torch.utils.benchmark import timer
 
 
 class Series(NamedTuple):
-    """What one of the things compared took, round by round, (rounds,) each."""
+    """The cost of one of the calls compared, per round, (rounds,) each."""
 
     ms: np.ndarray  # milliseconds of wall-clock time
-    cpu_ms: np.ndarray  # milliseconds of processor time, of all threads of this process
+    cpu_ms: np.ndarray  # milliseconds of CPU time, over all threads of this process
     faults: np.ndarray  # page faults
 
     def ratio(self, other: "Series") -> float:
-        """Median of the ratios within a round: of processor time where PyTorch has one thread, else of wall-clock time."""
+        """Median of the ratios within a round: of CPU time if PyTorch has one thread, else of wall-clock time."""
         numbers = (self.cpu_ms, other.cpu_ms) if th.get_num_threads() == 1 else (self.ms, other.ms)
         return median(numbers[0] / numbers[1])
 
 
 def median(numbers: Any) -> float:
-    """A plain number, for tables and JSON."""
+    """The median as a Python float, for tables and JSON."""
     return float(np.median(numbers))
 
 
 def read_clocks() -> np.ndarray:
     """Milliseconds and page faults so far, in the order of ``Series``. PyTorch's timer waits for a GPU first."""
-    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt  # pages given to this process without reading a disk
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt  # pages provided without reading a disk
     return np.array([timer() * 1e3, time.process_time() * 1e3, faults])
 
 
 def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, n_per_call: int = 1) -> dict[str, Series]:
     """
-    :param calls: what is compared; each is called once per round
-    :param rounds: number of rounds, after one that does not count
-    :param n_per_call: how many updates, draws, ... one call does: the series are per update
+    :param calls: the calls to compare; each is called once per round
+    :param rounds: number of rounds, after a first one that does not count
+    :param n_per_call: number of updates, samples, ... per call; the series are per update
     """
     found: dict[str, list[np.ndarray]] = {name: [] for name in calls}
     for _ in range(rounds + 1):
@@ -52,7 +52,7 @@ def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, n_per_cal
 
 
 def count_operations(call: Callable[[], object]) -> int:
-    """Operations that Python and the backward pass ask for: ``aten::`` events of the profiler outside any other of these."""
+    """Operations that Python and the backward pass launch: the profiler's ``aten::`` events outside other such events."""
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
         call()
 
@@ -66,12 +66,12 @@ def count_operations(call: Callable[[], object]) -> int:
 
 
 class Table(NamedTuple):
-    """Rows by key; the keys head the columns. None is printed as a dash, and a column of nothing else is left out."""
+    """Rows as dictionaries, whose keys are the column names. None is printed as a dash, and a column of None is left out."""
 
     name: str  # its key in the JSON file
     title: str
     rows: list[dict[str, Any]]
-    notes: list[str] = []  # lines below
+    notes: list[str] = []  # lines below the table
 
     def text(self) -> str:
         """Title, aligned columns, notes."""
@@ -83,5 +83,5 @@ class Table(NamedTuple):
 
 
 def three_digits(number: float) -> str:
-    """Or as many as there are before the point."""
+    """Format with three digits, or with all digits before the decimal point."""
     return f"{number:,.0f}" if abs(number) >= 99.95 else f"{number:#.3g}"

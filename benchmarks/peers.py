@@ -70,7 +70,7 @@ def run(package: str, folder: pathlib.Path) -> dict[str, list[str]]:
 
 
 def main() -> None:
-    """The command line."""
+    """Parse the command line, run the tests, print and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, help="the Markdown page to write")
     args = parser.parse_args()

@@ -1,7 +1,7 @@
 """
-What the latent state of an agent knows of the objects in a game: the share of variance (R²) of their places that a linear
-probe explains, on frames that the probe has not seen. Beside it the trunk's features, and the same of a new agent. MinAtar's
-objects stand in its planes, those of Atari in the console's memory.
+How well the latent state of an agent encodes the objects in a game: the fraction of variance (R²) of their positions that a
+linear probe explains, on held-out frames; the same for the trunk's features, and for an untrained agent. The positions are
+from MinAtar's planes, and for Atari from the console's memory.
 
     python -m benchmarks.probes --game Breakout --steps 10000 --seeds 0 1
     python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
@@ -22,7 +22,7 @@ from sb3_eqr import EqRRainbow, envs
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.visualize.latents import encode
 
-# MinAtar's planes (Young and Tian 2019); the mean place of what is drawn in one, and how much of it there is.
+# MinAtar's planes (Young and Tian 2019); targets are the mean position and the number of lit pixels per plane.
 PLANES = {
     "Breakout": ["paddle", "ball", "trail", "bricks"],
     "SpaceInvaders": ["cannon", "aliens", "aliens left", "aliens right", "own bullet", "their bullet"],
@@ -39,7 +39,7 @@ N_FRAMES, TRAINED_ON, RIDGE = 6_000, 4_500, 100.0
 def targets(planes: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
     """
     :param planes: (N, channels, 10, 10), 0 or 255
-    :return: name -> (N,), what varies of row, column and count of each plane; NaN where it is empty
+    :return: name -> (N,), row, column and count of each plane, as far as they vary; NaN where the plane is empty
     """
     found: dict[str, np.ndarray] = {}
     lit = planes > 0
@@ -55,7 +55,7 @@ def targets(planes: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
 
 
 def explained(inputs: np.ndarray, target: np.ndarray) -> float:
-    """R² of ridge regression on frames that it was not fitted to; of frames where there is something."""
+    """R² of ridge regression on held-out frames; frames with a NaN target are left out."""
     known = ~np.isnan(target)
     inputs, target = inputs[known], target[known]
     cut = int(len(target) * TRAINED_ON / N_FRAMES)
@@ -68,7 +68,7 @@ def explained(inputs: np.ndarray, target: np.ndarray) -> float:
 
 def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str, dict[str, float]]:
     """
-    :return: what is probed -> object -> R², of frames of the agent's own play, a third of its actions random
+    :return: what is probed -> object -> R², on frames of the agent's own episodes, with about a third of its actions random
     """
     obs, frames, memory = env.reset(), [], []
     for _ in range(N_FRAMES):
@@ -79,7 +79,7 @@ def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str
         action = rng.integers(0, env.action_space.n, 1) if rng.random() < 0.3 else action
         obs, *_ = env.step(action)
     seen = np.stack(frames)
-    order = rng.permutation(N_FRAMES)  # neighbours on both sides of the cut: the probe has seen the like
+    order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
     with th.no_grad():
         features = np.concatenate([model.policy.online.features(part).numpy() for part in th.as_tensor(seen).split(250)])
     inputs = {"trunk": features, "state": encode(model, th.as_tensor(seen)).cpu().numpy()}
@@ -91,11 +91,11 @@ def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str
 
 
 def main() -> None:
-    """The command line."""
+    """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--game", choices=[*PLANES, *MEMORY], default="Breakout")
     parser.add_argument("--agent", default="eqr_rainbow", help="a file of zoo_hyperparams")
-    parser.add_argument("--changes", type=yaml.safe_load, default={}, help="of its entry, as YAML")
+    parser.add_argument("--changes", type=yaml.safe_load, default={}, help="changes of its entry, as YAML")
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     args = parser.parse_args()

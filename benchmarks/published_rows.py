@@ -1,5 +1,5 @@
 """
-The last rows of the EqR paper's tables, computed from the scores that the package brings: docs/results/published.md.
+The last rows of the EqR paper's tables, computed from the scores in the package: docs/results/published.md.
 
     python -m benchmarks.published_rows
 """
@@ -34,12 +34,12 @@ def human_normalized(scores: pd.DataFrame) -> pd.DataFrame:
 
     :param scores: columns method, game, mean
     :return: rows games, columns methods
-    :raises ValueError: for a game that has no human score, with the names of those that have one
+    :raises ValueError: for a game without a human score, with the names of those that have one
     """
     reference = load_reference().pivot(index="game", columns="method", values="mean")
     unknown = set(scores["game"]) - set(reference.index)
     if unknown:
-        raise ValueError(f"games: expected some of {', '.join(reference.index)}, found {', '.join(sorted(unknown))}")
+        raise ValueError(f"game must be one of {', '.join(reference.index)}, got {', '.join(sorted(unknown))}.")
     table = scores.pivot(index="game", columns="method", values="mean")
     low, high = reference.loc[table.index, RANDOM], reference.loc[table.index, HUMAN]
     return table.sub(low, axis=0).div(high - low, axis=0)
@@ -47,10 +47,10 @@ def human_normalized(scores: pd.DataFrame) -> pd.DataFrame:
 
 def last_rows() -> pd.DataFrame:
     """
-    What the EqR paper prints under Tables 2, 3 and 4, computed from the scores in the tables.
+    The last rows of Tables 2, 3 and 4 of the EqR paper, computed from the scores in the tables.
 
-    :return: columns table (2, 3, 4), method, mean, median, superhuman (games above human), and the same three as printed:
-        printed_mean, printed_median, printed_superhuman; means and medians to the printed three decimals
+    :return: columns table (2, 3, 4), method, mean, median, superhuman (games above human), and the printed values of the
+        last three: printed_mean, printed_median, printed_superhuman; means and medians have three decimals, as printed
     """
     normalized = human_normalized(load_reference())
     rows = []
@@ -73,8 +73,8 @@ def last_rows() -> pd.DataFrame:
 
 def disagreements(rows: pd.DataFrame) -> list[str]:
     """
-    :param rows: of :func:`last_rows`
-    :return: a sentence for each figure that the paper prints otherwise than its scores give
+    :param rows: see :func:`last_rows`
+    :return: a sentence for each number in the paper that its scores do not give
     """
     return [
         f"{row['method']} in Table {row['table']}: the paper prints a {what} of {row[f'printed_{what}']:.3f}, "

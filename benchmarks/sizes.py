@@ -17,7 +17,7 @@ from benchmarks.workload import BATCH_SIZE, N_ACTIONS, N_STACK, SIZE, Floor, fil
 from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 
 AGENT = "EqRQRDQN"
-STORED, FILLED_BY = (10_000, 100_000, 1_000_000), 20  # transitions, and environments by which they are added
+STORED, FILLED_BY = (10_000, 100_000, 1_000_000), 20  # transitions, and number of environments that add them
 N_ENVS, N_PLAYED, N_UPDATES, N_DRAWS = (1, 8, 32), 256, 2, 30
 VARIANTS: dict[str, dict[Any, dict[str, Any]]] = {
     "M": {m: {"prediction_depth": m} for m in (0, 1, 2, 3, 5, 7, 10)},
@@ -27,17 +27,17 @@ VARIANTS: dict[str, dict[Any, dict[str, Any]]] = {
 
 
 def growth(costs: Sequence[float], arithmetic: Sequence[float]) -> list[float]:
-    """How many times as fast as the arithmetic, in any unit, costs have grown since the first size."""
+    """Growth of the costs since the first size, divided by that of the arithmetic, in any unit."""
     return [(cost / costs[0]) / (work / arithmetic[0]) for cost, work in zip(costs, arithmetic, strict=True)]
 
 
 def repeat(call: Callable[[], object]) -> list[object]:
-    """Call it ``N_DRAWS`` times: alone it is too short to be timed."""
+    """Call it ``N_DRAWS`` times, since one call is too short to time."""
     return [call() for _ in range(N_DRAWS)]
 
 
 def drawing_and_updating(size: int) -> dict[str, Callable[[], object]]:
-    """What is done with a full buffer of so many transitions: batches by priority and at random, and new priorities."""
+    """Calls on a full buffer of ``size`` transitions: prioritised and uniform batches, and new priorities."""
     space, actions = spaces.Box(0, 255, (N_STACK, SIZE, SIZE), np.uint8), spaces.Discrete(N_ACTIONS)
     windows: dict[str, Any] = {"n_steps": 10, "prediction_depth": 5, "frame_stack": N_STACK}  # Table 5
     buffer = PrioritizedSequenceReplayBuffer(size, space, actions, "cpu", FILLED_BY, **windows)
@@ -53,7 +53,7 @@ def drawing_and_updating(size: int) -> dict[str, Callable[[], object]]:
 
 
 def measure_stored(rounds: int, largest: int) -> Table:
-    """A batch of windows, by the number of stored transitions up to the largest."""
+    """Time of a batch of windows by number of stored transitions, up to the largest."""
     sizes = [size for size in STORED if size <= largest]
     work = {size: drawing_and_updating(size) for size in sizes}
     calls = {f"{what} {size}": partial(repeat, call) for size in sizes for what, call in work[size].items()}
@@ -69,7 +69,7 @@ def measure_stored(rounds: int, largest: int) -> Table:
 
 
 def measure_n_envs(rounds: int) -> Table:
-    """Acting and storing, by the number of environments in one process."""
+    """Time of acting and storing by number of environments in one process."""
     models = {str(n): make_agent(AGENT, env=make_env("atari", n)) for n in N_ENVS}
     found = take_turns({n: partial(play, model, N_PLAYED) for n, model in models.items()}, rounds, N_PLAYED)
     rows = [{"n_envs": n, "ms": median(found[n].ms), "growth": median(found[n].ms) / median(found["1"].ms)} for n in models]
@@ -77,7 +77,7 @@ def measure_n_envs(rounds: int) -> Table:
 
 
 def measure_variants(size: str, rounds: int) -> Table:
-    """An update, by M, K or the group, beside the floor."""
+    """Time of an update by M, K or the group, compared with the floor."""
     models = {str(value): make_trainable(AGENT, **kwargs) for value, kwargs in VARIANTS[size].items()}
     floors = {name: Floor(model) for name, model in models.items()}
     calls: dict[str, Callable[[], object]] = {f"floor {name}": partial(floors[name].steps, N_UPDATES) for name in models}
@@ -97,6 +97,6 @@ def measure_variants(size: str, rounds: int) -> Table:
 
 
 def measure_sizes(args: argparse.Namespace) -> Iterator[Table]:
-    """All of them, one after the other."""
+    """All of the above."""
     yield from (measure_stored(args.rounds, args.largest), measure_n_envs(args.rounds))
     yield from (measure_variants(size, args.rounds) for size in VARIANTS)

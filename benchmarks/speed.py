@@ -1,7 +1,8 @@
 """
-What an update and a step of the environment cost: ``python -m benchmarks.speed`` (docs/results/speed.md).
+The cost of an update and of an environment step: ``python -m benchmarks.speed`` (docs/results/speed.md).
 
-What is compared takes turns in one process: milliseconds are medians over the rounds, ratios medians of those within a round.
+The agents compared run alternately in one process. Milliseconds are medians over the rounds; ratios are computed within each
+round, and their median is shown.
 """
 
 import argparse
@@ -32,21 +33,21 @@ from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, byt
 from sb3_eqr.common.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
-N_COUNTED, N_BEFORE = 10, 50  # updates that are counted, and before: they begin with the backup that is made every 50 updates
+N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others: they begin with the backup that is made every 50 updates
 N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
-NEIGHBOUR_ROUNDS, EVALUATION_ROUNDS = 8, 3  # at most: they take long
+NEIGHBOUR_ROUNDS, EVALUATION_ROUNDS = 8, 3  # maximum numbers, as these rounds are slow
 GAME, N_GAMES, ONE_BY_ONE, MAX_STEPS = "Pong", 100, 5, 1_000
-BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # until this process has ended, at the latest
+BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
 
 
 def in_rounds_of_one(model: Any, n_updates: int) -> None:
-    """As many updates as ``model.train(n_updates)``."""
+    """The same number of updates as ``model.train(n_updates)``, one per call."""
     for _ in range(n_updates):
         model.train(1, model.batch_size)
 
 
 def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
-    """An update of each agent on each network beside QRDQN's and the floor, in long rounds and in rounds of one."""
+    """An update of each agent on each network, compared with QRDQN's and the floor, in long rounds and in rounds of one."""
     for key in args.network or NETWORKS:
         n_updates, models = NETWORKS[key].n_updates, {name: make_trainable(name, key, N_BEFORE) for name in AGENTS}
         counted = {name: count_operations(partial(one.train, N_COUNTED, one.batch_size)) for name, one in models.items()}
@@ -74,7 +75,7 @@ def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
 
 
 def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
-    """Updates on Atari frames with one and with two threads, beside a busy process."""
+    """Updates on Atari frames with one and with two threads, while another process is busy."""
     models = {name: make_trainable(name) for name in ("DQN", "QRDQN", *EQR_AGENTS)}
 
     def update(model: Any, n_threads: int) -> None:
@@ -97,7 +98,7 @@ def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
 
 
 def acting_and_storing(name: str, network: str) -> tuple[Callable[[], object], Callable[[], object]]:
-    """What an agent does in a step of the environment: it chooses an action by its network, and stores a transition."""
+    """The two calls of an agent per environment step: choose an action with its network, and store a transition."""
     model = make_trainable(name, network)
     env, transitions = model.env, []
     obs = env.reset()
@@ -115,7 +116,7 @@ def acting_and_storing(name: str, network: str) -> tuple[Callable[[], object], C
 
 
 def measure_steps(args: argparse.Namespace) -> Iterator[Table]:
-    """A step of the environment without the environment and without updates: acting and storing."""
+    """Acting and storing: an environment step without the environment itself and without updates."""
     clock = time.process_time if args.threads == 1 else timer
     for key in args.network or NETWORKS:
         calls = {name: acting_and_storing(name, key) for name in AGENTS}
@@ -131,7 +132,7 @@ def measure_steps(args: argparse.Namespace) -> Iterator[Table]:
 
 
 def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
-    """Where the time of an update goes, by PyTorch's profiler, whose own time is part of it: stages and operations."""
+    """The time of an update by stage and operation, from PyTorch's profiler, whose overhead is included."""
     for key, name in product(args.network or ["minatar"], EQR_AGENTS):
         model = make_trainable(name, key, N_BEFORE)
         policy, buffer = model.policy, model.replay_buffer
@@ -154,7 +155,7 @@ def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
 
 
 def measure_evaluation(args: argparse.Namespace) -> Iterator[Table]:
-    """The benchmark's evaluation beside SB3's on one environment; making the environments is part of it."""
+    """The benchmark's evaluation compared with SB3's on one environment, including creation of the environments."""
     from sb3_eqr.benchmark.evaluation import evaluate, play_environments
     from sb3_eqr.benchmark.suites import load_suite
     from sb3_eqr.envs import make_atari100k_env
@@ -183,17 +184,17 @@ PARTS = {measure.__name__.removeprefix("measure_"): measure for measure in MEASU
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The command line's arguments where none are given; an error of argparse for a wrong one."""
+    """Parse the given arguments, or else the command line; argparse reports wrong ones."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__.strip().split("\n")[0])
     several, all_but_sizes = partial(str.split, sep=","), [part for part in PARTS if part != "sizes"]
-    parser.add_argument("--only", metavar="PARTS", type=several, default=all_but_sizes, help=f"of {', '.join(PARTS)}")
-    networks = f"of {', '.join(NETWORKS)}; default: all, for profile minatar"
+    parser.add_argument("--only", metavar="PARTS", type=several, default=all_but_sizes, help=f"some of {', '.join(PARTS)}")
+    networks = f"some of {', '.join(NETWORKS)}; default: all, but minatar for profile"
     parser.add_argument("--network", metavar="NETWORKS", type=several, help=networks)
-    parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="threads of PyTorch")
-    parser.add_argument("--rounds", type=int, default=20, help="in which what is compared takes turns")
-    parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured in turns with this one")
-    parser.add_argument("--largest", type=int, default=STORED[-1], metavar="N", help="replay buffer of sizes; 7.2 kB each")
-    parser.add_argument("--json", metavar="FILE", help="write everything there, too")
+    parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
+    parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
+    parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured alternately with this one")
+    parser.add_argument("--largest", type=int, default=STORED[-1], metavar="N", help="largest buffer of sizes; 7.2 kB each")
+    parser.add_argument("--json", metavar="FILE", help="also write all tables to this file")
     args = parser.parse_args(arguments)
     for option, known in (("only", PARTS), ("network", NETWORKS)):
         for name in getattr(args, option) or []:
@@ -208,7 +209,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def surroundings(args: argparse.Namespace) -> dict[str, Any]:
-    """What the numbers depend on, for JSON."""
+    """Machine, versions and settings, which the measurements depend on, for JSON."""
     info = pathlib.Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,10 +1,10 @@
 """
-What the state x₀ says at initialisation, and whose gradient arrives there in the first updates.
+How much the latent state x₀ varies at initialisation, and which gradients reach it in the first updates.
 
     python -m benchmarks.state_signal --games Krull Pong MsPacman --json docs/results/state_signal.json
 
-Spread over states: the root mean square distance from the mean state. Of logits: the standard deviation over states
-without noise, and over draws of the head's noise at one state, each the root mean square over atoms and actions. Gradients:
+Spread over states: the root mean square distance from the mean state. Logits: the standard deviation over states without
+noise, and over samples of the head's noise at one state, each as root mean square over atoms and actions. Gradients: their
 norms where the losses meet, medians over the updates (train/td_state_gradient, train/aux_state_gradient).
 """
 
@@ -20,14 +20,14 @@ from sb3_eqr import EqRRainbow, envs
 from sb3_eqr.common.objective import LossCoefs
 from sb3_eqr.configurations import load_configuration
 
-N_DRAWS = 32  # of noise
+N_DRAWS = 32  # samples of noise
 
 
 @th.no_grad()
 def signal(model: EqRRainbow, observations: np.ndarray) -> dict[str, float]:
     """
-    :param model: any agent of ours
-    :param observations: as the environment gives them, (N, *obs_shape)
+    :param model: any EqR agent
+    :param observations: observations from the environment, (N, *obs_shape)
     :return: constant part and spread of the state, standard deviation of logits over states and over noise
     """
     policy = model.policy
@@ -46,11 +46,11 @@ def signal(model: EqRRainbow, observations: np.ndarray) -> dict[str, float]:
 
 def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
     """
-    Updates on what the buffer holds.
+    Train on the replay buffer.
 
-    :param model: an agent whose buffer has windows
+    :param model: an agent whose buffer has complete windows
     :param n_updates: number of updates
-    :return: medians of the norms of TD and auxiliary gradient at the state, and of their ratio, before it is limited
+    :return: medians of the norms of TD and auxiliary gradient at the state, and of their ratio before it is limited
     """
     norms = []
     record = model.objective.__class__.__call__
@@ -72,8 +72,8 @@ def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
 def measure(game: str, changes: dict[str, Any], configuration: str, n_updates: int, n_frames: int) -> dict[str, Any]:
     """
     :param game: an Atari game
-    :param changes: arguments of the agent beside those of the configuration
-    :param configuration: a file of ``zoo_hyperparams``, or "default": what ``EqRRainbow("CnnPolicy", env)`` is
+    :param changes: arguments of the agent that override the configuration's
+    :param configuration: a file of ``zoo_hyperparams``, or "default" for ``EqRRainbow("CnnPolicy", env)``
     :return: a row
     """
     th.manual_seed(0)
@@ -92,12 +92,12 @@ def measure(game: str, changes: dict[str, Any], configuration: str, n_updates: i
 
 
 def main() -> None:
-    """The command line."""
+    """Parse the command line, measure, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--games", nargs="+", default=["Krull", "Pong", "MsPacman"])
     parser.add_argument("--configurations", nargs="+", default=["paper", "default"])
     parser.add_argument("--updates", type=int, default=90)
-    parser.add_argument("--frames", type=int, default=1_000, help="of random play, from which is learnt")
+    parser.add_argument("--frames", type=int, default=1_000, help="frames of random actions to train on")
     parser.add_argument("--json", type=pathlib.Path, help="write all rows here")
     arguments = parser.parse_args()
     rows = []

@@ -1,11 +1,11 @@
 """
-Trials of settings on small games: what differs from an entry of ``zoo_hyperparams``, by name, over games and seeds; a row of
-one file for each run, so that no number is lost and none is run twice.
+Trials of settings on small games, over games and seeds. A trial has a name and changes an entry of ``zoo_hyperparams``. Each
+run appends a row to one file, so that no result is lost and no run is repeated.
 
     python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --seeds 0 1 2 3 4 --jobs 2
     python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --table
 
-A file of trials names each trial's agent (a file of ``zoo_hyperparams``: eqr_rainbow, stock/qrdqn, ...) and its changes:
+A file of trials gives the agent (a file of ``zoo_hyperparams``: eqr_rainbow, stock/qrdqn, ...) and the changes of each:
 
     no_noise: {agent: eqr_rainbow, changes: {exploration_final_eps: 0.01, policy_kwargs: {noisy: false}}}
 """
@@ -25,21 +25,21 @@ from typing import Any
 import numpy as np
 import yaml
 
-GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are for the final comparison alone
-WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # whose symmetry is known: name -> environment, its arguments
-    "torus": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25]}),  # 256 places, one is the goal
-    "large_torus": ("SlidingBallTorus-v0", {"n_steps": 32, "goal": [0.25, 0.25], "max_episode_steps": 200}),  # 1,024 places
+GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are only for the final comparison
+WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # environments with a known symmetry: name -> id, arguments
+    "torus": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25]}),  # 256 positions, one is the goal
+    "large_torus": ("SlidingBallTorus-v0", {"n_steps": 32, "goal": [0.25, 0.25], "max_episode_steps": 200}),  # 1,024 positions
     "pendulum": ("PixelPendulum-v0", {}),
 }
-N_PARTS = 10  # of a learning curve
+N_PARTS = 10  # points of a learning curve
 
 
 def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, Any]:
     """
-    One run, from the first step to 100 episodes of the greedy policy.
+    Train an agent, and evaluate its greedy policy over 100 episodes.
 
     :param trial: agent, changes
-    :return: what goes into its row
+    :return: the results for its row
     """
     import torch as th
     from sb3_contrib import QRDQN
@@ -57,7 +57,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_eqr.visualize.latents import replayed
 
     class Means(KVWriter):
-        """Keeps what is logged, to take its mean."""
+        """Collects the logged values, to average them."""
 
         def __init__(self) -> None:
             self.values: dict[str, list[float]] = defaultdict(list)
@@ -94,7 +94,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         lengths = [value for one in env.env_method("get_episode_lengths") for value in one]
         paid = np.flatnonzero(np.array(returns) > 0)
         goals = {"return_in_all": round(float(np.sum(returns)), 3), "episodes": len(returns)}
-        if len(paid):  # where returns are rewards: how long it took to find the first one, and what came of it
+        if len(paid):  # the step of the first reward
             goals["first_reward_at"] = int(np.cumsum(lengths)[paid[0]])
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
@@ -117,7 +117,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
 
 
 def merged(entry: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """An entry with changes, those of dictionaries merged; what RL Zoo evaluates is evaluated."""
+    """An entry with changes, where dictionaries are merged, and "dict(...)" strings are evaluated as in RL Zoo."""
     result = {**entry, **changes}
     for key, old in entry.items():
         if isinstance(old, str) and old.startswith("dict("):
@@ -128,20 +128,20 @@ def merged(entry: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
-    """All rows of a file, none if there is no such file."""
+    """All rows of a file; an empty list if it does not exist."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
 
 
 def mean_and_error(values: list[float]) -> str:
-    """Mean ± standard error, which one value has not."""
+    """Mean ± standard error; for a single value, the mean only."""
     error = f" ± {np.std(values, ddof=1) / np.sqrt(len(values)):.2f}" if len(values) > 1 else ""
     return f"{np.mean(values):.2f}{error}" if values else ""
 
 
 def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
     """
-    Markdown, a row per trial. Per game: the greedy policy's score ± its standard error over seeds, and behind it the same of
-    the mean return of the last tenth of training.
+    A Markdown table with a row per trial. Per game: the greedy policy's score ± its standard error over seeds, followed by
+    the same for the mean return over the last tenth of training.
     """
     lines = [f"| trial, {steps:,} steps | seeds | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 3) + "|"]
     for name in names:
@@ -161,8 +161,8 @@ def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps:
 
 def world_table(rows: list[dict[str, Any]], names: list[str], game: str, steps: int) -> str:
     """
-    Markdown, a row per trial in a world that pays 1 for its goal: how often it was reached in training, when first (the median
-    over seeds), how many steps an episode took from then on, and how often the greedy policy reaches it.
+    A Markdown table with a row per trial, for an environment with a reward of 1 at its goal: how often the goal was reached in
+    training, when first (median over seeds), the steps per goal after that, and how often the greedy policy reaches it.
     """
     lines = ["| trial | seeds | goals reached | first one at step | steps per goal from there on | greedy policy |"]
     lines.append("|---" * 6 + "|")
@@ -180,16 +180,16 @@ def world_table(rows: list[dict[str, Any]], names: list[str], game: str, steps: 
 
 
 def main() -> None:
-    """The command line."""
+    """Parse the command line, run what is missing, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("trials", type=pathlib.Path, help="YAML file")
     parser.add_argument("--rows", type=pathlib.Path, required=True, help="JSON lines, read and appended to")
-    parser.add_argument("--names", nargs="+", help="of trials; all in the file where not given")
-    parser.add_argument("--games", nargs="+", default=list(GAMES), help=f"of MinAtar, or of {', '.join(WORLDS)}")
+    parser.add_argument("--names", nargs="+", help="names of trials (default: all in the file)")
+    parser.add_argument("--games", nargs="+", default=list(GAMES), help=f"MinAtar's games, or some of {', '.join(WORLDS)}")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=10_000)
-    parser.add_argument("--jobs", type=int, default=2, help="runs at once, one thread each")
-    parser.add_argument("--table", action="store_true", help="print what there is, run nothing")
+    parser.add_argument("--jobs", type=int, default=2, help="parallel runs, one thread each")
+    parser.add_argument("--table", action="store_true", help="print the table of finished runs, run nothing")
     parser.add_argument("--one", nargs=3, metavar=("NAME", "GAME", "SEED"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     trials = yaml.safe_load(arguments.trials.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""What is measured: agents on three networks, random frames for their replay buffers, and the floor under an update."""
+"""The workload: agents on three networks, random frames for their replay buffers, and the floor of an update's time."""
 
 import importlib
 import pathlib
@@ -24,19 +24,19 @@ from sb3_eqr.common.features_extractor import ConvExtractor
 
 SIZE, N_STACK, N_ACTIONS = 84, 4, 6  # Atari's frames, Pong's actions
 BATCH_SIZE = 32  # Table 5, and SB3's default
-EPISODE = 250  # steps; an Atari game loses a life about as often
+EPISODE = 250  # steps; about the time between lost lives in an Atari game
 BUFFER_SIZE, N_STORED = 3_000, 1_100  # transitions
 OFF, BEFORE = ", group and losses off", " (before)"
 EQR_AGENTS = ("EqRQRDQN", "EqRRainbow")
 
 
 class Network(NamedTuple):
-    """An environment, and what agents are made with for it."""
+    """An environment, and the agents' arguments for it."""
 
     policy: str
     make_game: Callable[[], gym.Env]
     n_stack: int = 1
-    n_updates: int = 20  # in a round of updates that is timed
+    n_updates: int = 20  # in a timed round
     batch_size: int = BATCH_SIZE
     policy_kwargs: dict[str, Any] = {}
     qrdqn: dict[str, Any] = {}  # policy_kwargs of the stock agent
@@ -67,7 +67,7 @@ NETWORKS = {
         qrdqn={"n_quantiles": 51},
     ),
 }
-# Name -> class, and the convolutions of its package.
+# Name -> class, and the convolutional extractor of its package.
 ALGORITHMS: tuple[type[Any], ...] = (DQN, QRDQN, EqRQRDQN, EqRRainbow)
 AGENTS = {algorithm.__name__: (algorithm, ConvExtractor) for algorithm in ALGORITHMS}
 AGENTS |= {name + OFF: AGENTS[name] for name in EQR_AGENTS}
@@ -84,7 +84,7 @@ def add_before(folder: str) -> None:
     sys.path.insert(0, path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its environments replace those that are registered
+            warnings.simplefilter("ignore")  # its environments override the registered ones
             package = importlib.import_module("sb3_eqr")
             conv_extractor = importlib.import_module("sb3_eqr.common.features_extractor").ConvExtractor
         found = {name: (getattr(package, name), conv_extractor) for name in EQR_AGENTS}
@@ -96,7 +96,7 @@ def add_before(folder: str) -> None:
 
 
 def make_env(network: str, n_envs: int = 1) -> VecEnv:
-    """The network's environment, its frames stacked where it has several."""
+    """The network's environment, with stacked frames if ``n_stack`` is above 1."""
     game = NETWORKS[network]
     env = DummyVecEnv([game.make_game] * n_envs)
     return VecFrameStack(env, game.n_stack) if game.n_stack > 1 else env
@@ -106,8 +106,8 @@ def make_agent(
     name: str, network: str = "atari", env: VecEnv | None = None, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
 ) -> Any:
     """
-    An agent of ``AGENTS`` on one of ``NETWORKS`` that logs nothing. Its replay buffer is small and empty. ``env`` replaces the
-    environment of the network; ``policy_kwargs`` and ``kwargs`` add to its arguments.
+    Create an agent of ``AGENTS`` on one of ``NETWORKS``, which logs nothing. Its replay buffer is small and empty. ``env``
+    replaces the environment of the network; ``policy_kwargs`` and ``kwargs`` override its arguments.
     """
     (algorithm, conv_extractor), settings = AGENTS[name], NETWORKS[network]
     layers = {**settings.policy_kwargs, **(settings.qrdqn if name == "QRDQN" else {}), **(policy_kwargs or {})}
@@ -125,7 +125,7 @@ def make_agent(
 
 
 def make_trainable(name: str, network: str = "atari", n_updates: int = 3, **kwargs: Any) -> Any:
-    """As :func:`make_agent`, with ``N_STORED`` transitions of random actions, and past its first updates."""
+    """As :func:`make_agent`, with ``N_STORED`` transitions of random actions, after ``n_updates`` updates."""
     model = make_agent(name, network, **kwargs)
     starts, model.learning_starts = model.learning_starts, N_STORED + 1
     model.learn(N_STORED)
@@ -135,13 +135,13 @@ def make_trainable(name: str, network: str = "atari", n_updates: int = 3, **kwar
 
 
 def play(model: Any, n_steps: int) -> None:
-    """Act and store, without updates; ``n_steps`` of the environments together."""
+    """Act and store without updates, for ``n_steps`` over all environments."""
     model.learning_starts, model.gradient_steps = 0, 0
     model.learn(n_steps, reset_num_timesteps=False)
 
 
 def fill(buffer: Any, n_adds: int) -> None:
-    """The same random frames into any buffer of stacks, (4, 84, 84), by so many calls of ``add``."""
+    """Add random frames, the same each time, to a buffer of stacks (4, 84, 84), with ``n_adds`` calls of ``add``."""
     rng, n_envs = np.random.default_rng(0), buffer.n_envs
     stack = np.zeros((n_envs, N_STACK, SIZE, SIZE), dtype=np.uint8)
     for step in range(n_adds):
@@ -153,7 +153,7 @@ def fill(buffer: Any, n_adds: int) -> None:
 
 
 def bytes_per_transition(model: Any) -> float:
-    """All arrays of the replay buffer over its capacity."""
+    """The size of all arrays of the replay buffer, divided by its capacity."""
     buffer, names = model.replay_buffer, ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
     nbytes = buffer.nbytes if hasattr(buffer, "nbytes") else sum(getattr(buffer, name).nbytes for name in names)
     return nbytes / (buffer.buffer_size * buffer.n_envs)
@@ -161,11 +161,11 @@ def bytes_per_transition(model: Any) -> float:
 
 class Floor:
     """
-    The convolutions of one update of an EqR agent whose target is a copy of its online network: without gradient those of the
-    observation after the transition and of the M observations of the rollout, with gradient those of the observation itself,
-    but for the images. Each runs on inputs of its own, float32, channels last.
+    The convolutions of one update of an EqR agent whose target is a copy of its online network: without gradient for the
+    observation after the transition and the M observations of the rollout; with gradient, except that of the images, for the
+    observation itself. Each runs on separate inputs, float32, channels last.
 
-    :param model: whose batch size, M and encoder these are
+    :param model: the agent, which determines batch size, M and encoder
     """
 
     def __init__(self, model: Any):
@@ -191,9 +191,9 @@ class Floor:
         self.flop = counter.get_total_flops()  # of one update
 
     def steps(self, n_updates: int) -> None:
-        """The convolutions of so many updates."""
+        """Run the convolutions of ``n_updates`` updates."""
         for _ in range(n_updates):
-            with th.no_grad():  # by ``forward``, past all hooks
+            with th.no_grad():  # ``forward`` skips hooks
                 for module, images, _, _ in self._work:
                     module.forward(images)
             outputs = [module.forward(images) for module, _, images, _ in self._work]
@@ -202,6 +202,6 @@ class Floor:
                 th.autograd.grad(output, wanted, gradient)
 
     def description(self) -> str:
-        """One line."""
+        """A description in one line."""
         images = f"{self.n_forward} images forward, {self.n_trained} forward and backward"
         return f"floor: {len(self._work)} convolutions, channels last, {images}: {self.flop / 1e9:.3f} GFLOP an update"

@@ -1,4 +1,4 @@
-"""What a package must stand: tests that kill it, feed it wrong and hostile input, and take its disk away."""
+"""Stress tests of the package: they kill it, pass wrong and hostile input, and fill its disk."""
 
 import dataclasses
 
@@ -9,10 +9,10 @@ class Finding:
     A row of the table.
 
     :param test: what was done
-    :param must: what must come out
-    :param found: what came out
-    :param holds: whether it is what must
-    :param details: what fell short, a line each
+    :param must: required result
+    :param found: actual result
+    :param holds: whether the requirement is met
+    :param details: failures, a line each
     """
 
     test: str

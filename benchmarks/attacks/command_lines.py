@@ -1,4 +1,4 @@
-"""Wrong command lines: each must end with a message and without a traceback, and none may take long."""
+"""Wrong command lines: each must exit with a message and no traceback, within a few seconds."""
 
 import importlib
 import os
@@ -11,9 +11,9 @@ from benchmarks.attacks import Finding
 from benchmarks.attacks.kills import FORK
 from sb3_eqr import EqRRainbow
 
-LONGEST = 5.0  # seconds to an answer
+LONGEST = 5.0  # seconds until it must exit
 MODULES = {"benchmark": "sb3_eqr.benchmark.__main__", "visualize": "sb3_eqr.visualize.__main__"}
-# Files of hyperparameters with something wrong. The entry's own values: what is put after them wins.
+# Invalid files of hyperparameters. In KEYS, the value that follows the entry's own overrides it.
 ENTRIES = ["[]", "3", "text", "CartPole-v1: [1, 2]", "CartPole-v1: 3", "CartPole-v1: text", "{", "a: b: c", "\x00"]
 ENTRIES += [
     "CartPole-v1: {policy: MlpPolicy}",
@@ -56,7 +56,7 @@ for scores in ("[1, 1]", "[2, 1]", "[.nan, 1]", "[1]", "text", "[0, .inf]", "nul
 
 
 def write_files(folder: pathlib.Path) -> None:
-    """The files that the lines name."""
+    """Write the files that the command lines name."""
     model = folder / "model.zip"
     EqRRainbow("MlpPolicy", "CartPole-v1", buffer_size=100, policy_kwargs={"n_blocks": 1, "net_arch": [4]}).save(model)
     (folder / "text.zip").write_text("no zip file")
@@ -70,8 +70,8 @@ def write_files(folder: pathlib.Path) -> None:
 
 def cases(folder: pathlib.Path) -> Iterator[tuple[str, list[str]]]:
     """
-    :param folder: of :func:`write_files`
-    :return: beginnings of lines, and the ends that each is tried with
+    :param folder: the folder of :func:`write_files`
+    :return: beginnings of command lines, each with the endings to try
     """
     entries, suites = ([str(path) for path in sorted(folder.glob(f"{name}_*.yml"))] for name in ("entry", "suite"))
     zips = [f"{folder}/{name}" for name in ("text.zip", "half.zip", "none.zip", "empty", "")]
@@ -122,7 +122,7 @@ def cases(folder: pathlib.Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def answer(line: str, log: pathlib.Path) -> None:
-    """Do what ``sb3-eqr`` does with a line, in a process of its own."""
+    """Run a command line as ``sb3-eqr`` does, in a separate process."""
     with open(log, "w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -133,7 +133,7 @@ def answer(line: str, log: pathlib.Path) -> None:
 
 
 def wrong_command_lines(folder: pathlib.Path) -> Finding:
-    """Every line; a message without a traceback, a status other than 0."""
+    """Try every command line: it must print a message without a traceback and exit with a status other than 0."""
     folder.mkdir(parents=True)
     for module in (*MODULES.values(), "sb3_eqr.zoo.__main__", "rl_zoo3.train", "rl_zoo3.enjoy", "ray"):
         importlib.import_module(module)  # once, not in each process

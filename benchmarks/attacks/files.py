@@ -27,18 +27,18 @@ from sb3_eqr.benchmark.training import load_checkpoint
 from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.visualize.loading import load_model, make_env
 
-RAN = pathlib.Path("ran")  # what a file that runs code leaves
+RAN = pathlib.Path("ran")  # the file that hostile code creates
 
 
 class Runs:
-    """Unpickled, it makes a file."""
+    """Creates a file when it is unpickled."""
 
     def __reduce__(self) -> Any:
         return pathlib.Path.touch, (RAN,)
 
 
 def trained(folder: pathlib.Path) -> Any:
-    """An agent with a model, a buffer and checkpoints in a folder."""
+    """Train an agent, and write its model, buffer and checkpoints into a folder."""
     model = make(env=make_vec_env("CartPole-v1"), seed=0)
     model.learn(120, ExactCheckpointCallback(50, folder / "checkpoints"))
     model.save(folder / "model")
@@ -47,7 +47,7 @@ def trained(folder: pathlib.Path) -> Any:
 
 
 def repacked(source: pathlib.Path, path: pathlib.Path, changes: dict[str, bytes]) -> pathlib.Path:
-    """A zip file with other contents in some of its members."""
+    """Copy a zip file, replacing the contents of some members."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(path, "w") as copy:
         for name in archive.namelist():
@@ -56,7 +56,7 @@ def repacked(source: pathlib.Path, path: pathlib.Path, changes: dict[str, bytes]
 
 
 def hostile(folder: pathlib.Path) -> Iterator[tuple[str, str, pathlib.Path]]:
-    """Name, kind and path of each hostile file."""
+    """Write the hostile files; yields name, kind and path of each."""
     evil, model = pickle.dumps(Runs()), folder / "model.zip"
     text = base64.b64encode(evil).decode()
     with zipfile.ZipFile(model) as archive:
@@ -109,7 +109,7 @@ def hostile(folder: pathlib.Path) -> Iterator[tuple[str, str, pathlib.Path]]:
 
 
 def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], Any]]]:
-    """Every way in, by kind of file."""
+    """All functions that load a file, by kind of file."""
     model, env = make(), make_vec_env("CartPole-v1")
     into_run = make(env=make_vec_env("CartPole-v1"))
     return {
@@ -128,7 +128,7 @@ def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], 
 
 
 def trusting(kind: str) -> Callable[[pathlib.Path], Any]:
-    """The way in that trusts a file."""
+    """A function that loads a file with ``trust=True``."""
     if kind == "buffer":
         return lambda path: make().load_replay_buffer(path, trust=True)
     if kind == "shown":
@@ -137,7 +137,7 @@ def trusting(kind: str) -> Callable[[pathlib.Path], Any]:
 
 
 def runs_code(load: Callable[[pathlib.Path], Any], path: pathlib.Path) -> bool:
-    """Whether loading a file, which may fail, has run what it names."""
+    """Whether loading a file, which may fail, runs the code that it names."""
     with contextlib.suppress(Exception), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         load(path)
@@ -147,7 +147,7 @@ def runs_code(load: Callable[[pathlib.Path], Any], path: pathlib.Path) -> bool:
 
 
 def strangers_files(folder: pathlib.Path) -> Finding:
-    """Each hostile file on each way in."""
+    """Load each hostile file with each function for its kind."""
     folder.mkdir(parents=True)
     trained(folder)
     ways, wrong, tries, alive = load_paths(folder), [], 0, 0
@@ -157,7 +157,7 @@ def strangers_files(folder: pathlib.Path) -> Finding:
             tries += 1
             if runs_code(load, path):
                 wrong.append(f"{name}, way {number}: ran code")
-    for _, kind, path in files:  # where they are trusted, they are dangerous indeed
+    for _, kind, path in files:  # with trust=True they must run code, else they would prove nothing
         alive += runs_code(trusting(kind), path)
     test = f"{len(files)} hostile files, {tries} loads"
     found = f"{len(wrong)} ran code, {alive} with trust"
@@ -165,7 +165,7 @@ def strangers_files(folder: pathlib.Path) -> Finding:
 
 
 def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
-    """Truncated at 20 places and flipped at 20, each kind of file; the agent stays as it was."""
+    """Truncate each kind of file at 20 places and flip a bit at 20; loading must fail and leave the agent unchanged."""
     folder.mkdir(parents=True)
     model = trained(folder)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
@@ -191,7 +191,7 @@ def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
                 wrong.append(f"{path.name}, {kind} at {place}: loaded")
             except Exception as error:
                 if not str(error):
-                    wrong.append(f"{path.name}, {kind} at {place}: {type(error).__name__} without a word")
+                    wrong.append(f"{path.name}, {kind} at {place}: {type(error).__name__} without a message")
             path.write_bytes(whole)
             is_same = all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
             if not is_same or model.replay_buffer.size() != size:
@@ -203,7 +203,7 @@ def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
 
 
 def shared_path(folder: pathlib.Path) -> Finding:
-    """Threads that save to one path and load from it."""
+    """Save to one path and load from it in several threads."""
     folder.mkdir(parents=True)
     model = make()
     model.save(folder / "model")
@@ -247,7 +247,7 @@ def shared_path(folder: pathlib.Path) -> Finding:
 
 
 def full_disk(folder: pathlib.Path) -> Finding:
-    """A run whose checkpoints fill a small disk."""
+    """Run an agent whose checkpoints fill a small disk."""
     folder.mkdir(parents=True)
     test, must = "a full disk (tmpfs of 2 MB)", "the last checkpoint is intact, and the message says so"
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)], capture_output=True)

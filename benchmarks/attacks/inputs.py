@@ -1,4 +1,4 @@
-"""Wrong input: arguments by the table and by hand, and command lines. Each must be answered by name, expected and got."""
+"""Wrong arguments, from the tables and by hand. Each error must say what is wrong, what it must be and what it got."""
 
 import contextlib
 import io
@@ -19,27 +19,27 @@ from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, Rule
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import load_configuration
 
-LONGEST = 5.0  # seconds to an answer
+LONGEST = 5.0  # seconds until the error
 NAN, INF = float("nan"), float("inf")
 POOL: list[Any] = [NAN, INF, -INF, -1, -0.5, 2.5, 1e400, True, "x", "", "1", None, [], [0], {}, 1j, object, np.ones(2)]
 SMALL = {"n_blocks": 2, "net_arch": [8], "latent_hidden_dim": 8}
-Case = tuple[str, str, Callable[[], Any]]  # what, a word that the answer must hold, and the call
+Case = tuple[str, str, Callable[[], Any]]  # what, a word that the message must contain, and the call
 
 
 def make(agent: type = EqRQRDQN, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:
-    """A small agent."""
+    """Create a small agent."""
     policy_kwargs = {**SMALL, **kwargs.pop("policy_kwargs", {})}
     return agent(policy, env, **{"buffer_size": 500, "learning_starts": 20, **kwargs}, policy_kwargs=policy_kwargs)
 
 
 def refused(table: dict[str, Rule], names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """The names of a table, or some of them, with each value of the pool that their rules refuse."""
+    """Yield the names of a table, or some of them, with each value of the pool that their rules reject."""
     for name in names or table:
         yield from ((name, value) for value in POOL if not table[name].holds(value))
 
 
 def from_the_tables() -> Iterator[Case]:
-    """Each argument with each value that its rule refuses; those of the algorithm once more, set later."""
+    """Each argument with each value that its rule rejects; arguments of the algorithm also as attributes set later."""
     model = make()
     for name, value in refused(ALGORITHM):
         yield f"{name}={value!r}", name, partial(EqRQRDQN, "MlpPolicy", "CartPole-v1", **{name: value})
@@ -56,7 +56,7 @@ def from_the_tables() -> Iterator[Case]:
 
 
 def set_and_learn(model: Any, name: str, value: Any) -> None:
-    """An attribute that is set after the constructor has looked at it."""
+    """Set an attribute after the constructor has checked it, and learn."""
     before = getattr(model, name)
     try:
         setattr(model, name, value)
@@ -66,7 +66,7 @@ def set_and_learn(model: Any, name: str, value: Any) -> None:
 
 
 class Broken(gym.Env):
-    """An environment that breaks the contract of gymnasium in one way."""
+    """An environment that violates gymnasium's API in one way."""
 
     def __init__(self, how: str):
         self.how = how
@@ -76,7 +76,7 @@ class Broken(gym.Env):
             del self.observation_space
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """As gymnasium wants it, or not."""
+        """As in gymnasium's API, or not."""
         super().reset(seed=seed)
         obs = np.zeros(4 if self.how == "another shape at reset" else 3, dtype=np.float32)
         return obs if self.how == "reset without info" else (obs, {})
@@ -137,13 +137,13 @@ def by_hand() -> Iterator[Case]:
 
 
 def add(model: Any, action: float, reward: float) -> None:
-    """A transition straight into the replay buffer."""
+    """Add a transition directly to the replay buffer."""
     obs, zero = np.zeros((1, 4), dtype=np.float32), np.zeros(1)
     model.replay_buffer.add(obs, obs, np.array([action]), np.array([reward]), zero, [{}])
 
 
 def ask(case: Case) -> str | None:
-    """What is wrong with the answer; ``None``: nothing."""
+    """:return: what is wrong with the error of a case; ``None`` if nothing is"""
     what, word, call = case
     began = time.monotonic()
     try:
@@ -169,14 +169,14 @@ def ask(case: Case) -> str | None:
                 "unknown",
             )
         )
-        return None if is_explained else f"{what}: {type(error).__name__} does not say what was expected: {text[:100]}"
+        return None if is_explained else f"{what}: {type(error).__name__} does not say what it must be: {text[:100]}"
     except Exception as error:
         return f"{what}: {type(error).__name__}: {str(error)[:100]}"
     return f"{what}: silent"
 
 
 def wrong_arguments() -> Finding:
-    """Every case of the tables and by hand."""
+    """Try every case from the tables and by hand."""
     cases = [*from_the_tables(), *by_hand()]
     wrong = [found for found in map(ask, cases) if found is not None]
     must = "every error names the argument, what it must be and what it got; none silent, none over 5 s"
@@ -184,7 +184,7 @@ def wrong_arguments() -> Finding:
 
 
 def without_asserts() -> Finding:
-    """The same in an interpreter that leaves assertions out."""
+    """The same with ``python -O``, which removes assertions."""
     call = "from benchmarks.attacks.inputs import wrong_arguments as f; x = f(); print(x.found, *x.details, sep='\\n')"
     done = subprocess.run([sys.executable, "-O", "-c", call], capture_output=True, text=True)
     found, *wrong = done.stdout.strip().splitlines() or [done.stderr[-200:]]

@@ -1,4 +1,4 @@
-"""SIGKILL at random moments of runs that write checkpoints: nothing may be lost, and no number may change."""
+"""SIGKILL at random times, for runs that write checkpoints: nothing may be lost, and no result may change."""
 
 import json
 import multiprocessing
@@ -19,14 +19,14 @@ from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
 
-STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints a second
-LONGEST = 1.5  # seconds that a run lives before it is killed
-KILLS_OF_ONE = 30  # short runs end before that
-FORK = multiprocessing.get_context("fork")  # nothing has to be imported again
+STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints per second
+LONGEST = 1.5  # maximum seconds before a run is killed
+KILLS_OF_ONE = 30  # short runs finish earlier
+FORK = multiprocessing.get_context("fork")  # avoids importing everything again
 
 
 def train(folder: pathlib.Path) -> None:
-    """A run, from its beginning or from its last checkpoint, to its end."""
+    """Start a run, or resume it from its last checkpoint, and finish it."""
     th.set_num_threads(1)
     if find_checkpoints(folder):
         model = EqRQRDQN.resume(folder, make_vec_env("CartPole-v1"))
@@ -42,9 +42,9 @@ def train(folder: pathlib.Path) -> None:
 
 def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> tuple[list[Any], int]:
     """
-    Start a run as often as it takes: it is killed until so many kills have met a living process, then it may end.
+    Start a run again and again, and kill it until ``kills`` kills have hit a running process; then let it finish.
 
-    :return: exit codes that are neither 0 nor that of the kill, and how many kills there were
+    :return: exit codes other than 0 and that of the kill, and the number of kills
     """
     strange: list[Any] = []
     done = 0
@@ -66,18 +66,18 @@ def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at
 
 
 def left_over(folder: pathlib.Path) -> list[str]:
-    """Partial files: they begin with a dot."""
+    """Partial files, whose names begin with a dot."""
     return [str(path) for path in folder.rglob(".*")]
 
 
 def same_parameters(first: pathlib.Path, second: pathlib.Path) -> bool:
-    """Whether two runs ended with the same bits."""
+    """Whether two runs ended with bit-identical parameters."""
     one, other = (EqRQRDQN.load(folder / "final.zip").policy.state_dict() for folder in (first, second))
     return all(th.equal(one[name], other[name]) for name in one)
 
 
 def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: int) -> Finding:
-    """One run, or several at once on one folder, killed again and again, beside an undisturbed one."""
+    """Compare a run that is killed repeatedly, or several at once in one folder, with an undisturbed run."""
     undisturbed, killed = folder / "undisturbed", folder / f"killed_{at_once}"
     if not (undisturbed / "final.zip").is_file():
         kill_until_done(lambda: train(undisturbed), 0, rng)
@@ -94,7 +94,7 @@ def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: i
 
 
 def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Finding:
-    """The runs of the suite smoke as Ray's workers do them, seed after seed, killed, beside undisturbed ones."""
+    """Compare killed runs of the suite smoke, as Ray's workers execute them, with undisturbed ones, seed by seed."""
     suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
     agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
     different: list[Any] = []
@@ -118,7 +118,7 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
 
 
 def scores(run: Run) -> Any:
-    """What a finished run has measured."""
+    """The measurements of a finished run."""
     path = run.folder / RESULT
     result = json.loads(path.read_text()) if path.is_file() else None
     return None if result is None else (result["evaluations"], result["training"])

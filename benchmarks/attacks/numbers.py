@@ -1,4 +1,4 @@
-"""NaN wherever one can arise: it must be stopped and named, and never be saved."""
+"""NaN wherever one can arise: it must raise an error that names it, and never be saved."""
 
 import pathlib
 import re
@@ -17,25 +17,25 @@ UPDATES = {"first": 1, "middle": (STEPS - LEARNING_STARTS) // 2, "last": STEPS -
 
 
 class Poisoned(gym.ObservationWrapper):
-    """CartPole with a NaN in one observation or reward. ``at``: the step."""
+    """CartPole with a NaN in the observation or reward of step ``at``."""
 
     def __init__(self, what: str, at: int):
         super().__init__(gym.make("CartPole-v1"))
         self.what, self.at, self.steps = what, at, 0
 
     def observation(self, observation: Any) -> Any:
-        """As it is, or NaN."""
+        """The observation, or NaN."""
         return observation * (np.nan if self.what == "observation" and self.steps == self.at else 1)
 
     def step(self, action: Any) -> Any:
-        """Likewise, with the reward."""
+        """As gymnasium's ``step``; the reward may be NaN."""
         self.steps += 1
         observation, reward, *rest = super().step(action)
         return observation, np.nan if self.what == "reward" and self.steps == self.at else reward, *rest
 
 
 def poison(model: Any, what: str, update: int) -> None:
-    """NaN in the loss, the gradient or a parameter at one update."""
+    """Put a NaN into the loss, the gradient or a parameter at one update."""
     objective, after = model.objective, model.policy.after_gradient_step
     parameter = next(model.policy.online.head.parameters())
     count = 0
@@ -60,13 +60,13 @@ def poison(model: Any, what: str, update: int) -> None:
 
 
 def is_finite(path: pathlib.Path, kind: type) -> bool:
-    """Whether a file holds finite parameters alone."""
+    """Whether all parameters in a file are finite."""
     state = kind.load(path).policy.state_dict()  # type: ignore[attr-defined]
     return all(bool(th.isfinite(value).all()) for value in state.values() if value.is_floating_point())
 
 
 def not_a_number(folder: pathlib.Path) -> Finding:
-    """Each place, at the first, a middle and the last update, for both agents."""
+    """Try each place, at the first, a middle and the last update, for both agents."""
     folder.mkdir(parents=True)
     wrong, count = [], 0
     for kind in (EqRQRDQN, EqRRainbow):
@@ -83,7 +83,7 @@ def not_a_number(folder: pathlib.Path) -> Finding:
                     model.learn(STEPS)
                     wrong.append(f"{name}: silent")
                 except Exception as error:
-                    step = re.search(r"step (\d+)", str(error))  # what an update did is looked at within two more
+                    step = re.search(r"step (\d+)", str(error))  # an update is checked within two more
                     is_near = step is not None and 0 <= int(step[1]) - LEARNING_STARTS - update <= 2
                     if "finite" not in str(error) or not is_near:
                         wrong.append(f"{name}: {type(error).__name__}: {str(error)[:100]}")

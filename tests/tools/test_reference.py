@@ -1,4 +1,4 @@
-"""The bundled figures give the last rows that the paper prints."""
+"""The bundled scores give the last rows that the paper prints."""
 
 import json
 
@@ -27,7 +27,7 @@ PRINTED = {
     "EqR, L_{GET} [EqR Tab4]": (0.749, 0.377, 6),
     "EqR, $L_R + L_{GET}$ [EqR Tab4]": (0.886, 0.398, 7),
 }
-# What the scores in the tables give where the line under them says something else by one in the last digit.
+# Means and medians of the tables' scores that differ from the printed ones by one in the last digit.
 OWN = {("SPR [EqR Tab2]", 0): 0.703, ("MLP [EqR Tab3]", 1): 0.399}
 
 
@@ -44,7 +44,7 @@ def test_last_rows(scores, method):
     assert found == expected
 
 
-def test_what_is_bundled(scores):
+def test_the_bundled_scores(scores):
     assert scores.columns.tolist() == ["method", "game", "runs", "mean", "sd", "source"]
     assert scores.groupby("method")["game"].nunique().eq(26).all() and not scores.duplicated(["method", "game"]).any()
     assert scores["source"].str.len().gt(5).all() and scores["runs"].ge(1).all()
@@ -52,12 +52,12 @@ def test_what_is_bundled(scores):
     assert normalized["Random"].eq(0).all() and normalized["Human"].eq(1).all()
 
 
-def test_unknown_games_are_named(scores):
-    with pytest.raises(ValueError, match="found tetris"):
+def test_unknown_games_raise(scores):
+    with pytest.raises(ValueError, match="got tetris"):
         human_normalized(scores.head(1).assign(game="tetris"))
 
 
-def test_the_last_rows_are_printed_ones_but_for_two():
+def test_the_last_rows_match_the_paper_except_two():
     rows = last_rows()
     names = {2: "Tab2", 3: "Tab3", 4: "Tab4"}
     for row in rows.to_dict("records"):
@@ -89,7 +89,7 @@ def test_games_match_in_any_spelling():
         match_games(["Pong", "pong"], ["Pong"])
 
 
-def test_runs_are_read(tmp_path):
+def test_reading_runs(tmp_path):
     file = tmp_path / "runs.json"
     file.write_text(json.dumps({"pong": [1, 2.5, 3], "bank heist": [4, 5], "Hero": [6]}))
     found = read_runs(file, "X", ["BankHeist", "Pong"], others=["Hero", "pong"])
@@ -114,7 +114,7 @@ def test_runs_are_read(tmp_path):
         ('{"Pong": [1], "BankHeis": [1]}', r"got 'BankHeis'. Did you mean 'BankHeist'\? Correct the name"),
     ],
 )
-def test_files_of_runs_that_are_wrong(tmp_path, content, message):
+def test_invalid_files_of_runs(tmp_path, content, message):
     file = tmp_path / "x.json"
     file.write_text(content)
     with pytest.raises(ValueError, match=message):
