@@ -30,14 +30,14 @@ def test_all_names_of_a_game(game):
 def test_names_of_two_words_and_unknown_games():
     assert atari.atari_env_id("MsPacman") == atari.atari_env_id("ms_pacman") == atari.atari_env_id("Ms Pacman")
     assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
-    with pytest.raises(ValueError, match="did you mean Pong"):
+    with pytest.raises(ValueError, match="Did you mean Pong"):
         make_atari100k_env("Pnog")
     for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # a different protocol
-        with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'Pong"):
+        with pytest.raises(ValueError, match="Atari game such as 'Pong', got 'Pong"):
             make_atari100k_env(other)
     with pytest.raises(ValueError, match="n_envs"):
         make_atari100k_env("Pong", n_envs=0)
-    with pytest.raises(ValueError, match="Atari game such as 'Pong', found 'CartPole-v1'"):
+    with pytest.raises(ValueError, match="Atari game such as 'Pong', got 'CartPole-v1'"):
         make_atari100k_env("CartPole-v1")
 
 
@@ -199,7 +199,7 @@ def test_the_wrapper_for_rl_zoo_gives_the_training_environment():
 
 
 def test_the_wrapper_rejects_a_different_protocol():
-    with pytest.raises(ValueError, match=r"found .*'repeat_action_probability': 0.25.*NoFrameskip-v4 name"):
+    with pytest.raises(ValueError, match=r"got .*'repeat_action_probability': 0.25.*NoFrameskip-v4 name"):
         make_vec_env("ALE/Pong-v5", wrapper_class=Atari100kWrapper)
     kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}
     assert make_vec_env("ALE/Pong-v5", env_kwargs=kwargs, wrapper_class=Atari100kWrapper).observation_space.shape == (

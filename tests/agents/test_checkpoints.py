@@ -85,7 +85,7 @@ def test_a_damaged_checkpoint_raises(checkpoint, name, damage):
         path.write_bytes(
             content[:half] if damage == "truncated" else content[:half] + bytes([content[half] ^ 1]) + content[half + 1 :]
         )
-    with pytest.raises(ValueError, match=r"must be (as it was written|a complete checkpoint|a checkpoint or a folder)"):
+    with pytest.raises(ValueError, match=r"must be (unchanged|a complete checkpoint|a checkpoint or a folder)"):
         EqRQRDQN.resume(checkpoint, ChainEnv())
 
 
@@ -94,7 +94,7 @@ def test_the_last_complete_checkpoint_is_used(checkpoint):
     assert EqRQRDQN.resume(checkpoint.parent, ChainEnv()).num_timesteps == int(checkpoint.name.partition("-")[2])
     with pytest.raises(ValueError, match="got nothing"):
         EqRQRDQN.resume(checkpoint.parent / "none", ChainEnv())
-    with pytest.raises(ValueError, match="expected a policy derived from EqRRainbowPolicy"):
+    with pytest.raises(ValueError, match="policy must be derived from EqRRainbowPolicy"):
         EqRRainbow.resume(checkpoint, ChainEnv())
 
 
@@ -133,7 +133,7 @@ def test_a_run_without_a_seed_cannot_restart_in_its_folder(tmp_path):
         if is_first:
             model.learn(60, ExactCheckpointCallback(20, tmp_path))
         else:
-            with pytest.raises(ValueError, match="this one has no seed"):
+            with pytest.raises(ValueError, match="this run has no seed"):
                 model.learn(60, ExactCheckpointCallback(20, tmp_path))
 
 
@@ -146,5 +146,5 @@ def test_the_environment_must_be_built_in_the_same_way(checkpoint):
 
 def test_stock_agents_cannot_resume(tmp_path):
     model = DQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
-    with pytest.raises(ValueError, match=r"expected an agent of this package.*found DQN. Use SB3's CheckpointCallback"):
+    with pytest.raises(ValueError, match=r"must be one of this package.*got DQN. Use SB3's CheckpointCallback"):
         model.learn(5, ExactCheckpointCallback(2, tmp_path))

@@ -197,7 +197,7 @@ def test_rl_zoos_schedules_are_schedules():
 
 
 def test_unknown_names_raise():
-    with pytest.raises(ValueError, match=r"expected one of .*'eqr_bbf'.*found 'bbf'"):
+    with pytest.raises(ValueError, match=r"name must be one of .*'eqr_bbf'.*got 'bbf'"):
         load_configuration("bbf")
-    with pytest.raises(ValueError, match=r"expected an entry of .*'atari'.*found 'CartPole-v1'"):
+    with pytest.raises(ValueError, match=r"env_id must be one of .*'atari'.*got 'CartPole-v1'"):
         load_configuration("eqr_bbf", "CartPole-v1")

@@ -21,12 +21,12 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 @pytest.mark.parametrize(
     "kwargs, message",
     [
-        ({"buffer_size": 5}, "prediction_depth \\+ 1 = 6 transitions per environment, found 5"),
-        ({"policy_kwargs": {"group": "SU(2)"}}, "expected GL\\(n\\), SE\\(n\\).*found 'SU\\(2\\)'"),
+        ({"buffer_size": 5}, "prediction_depth \\+ 1 = 6 transitions per environment, got 5"),
+        ({"policy_kwargs": {"group": "SU(2)"}}, "group must be GL\\(n\\), SE\\(n\\).*got 'SU\\(2\\)'"),
         ({"policy_kwargs": {"group": "SO(1)"}}, "SO\\(n\\) with n >= 2"),
         ({"policy_kwargs": {"n_blocks": 0}}, "n_blocks must be an integer >= 1( or None)?, got 0"),
         ({"policy_kwargs": {"n_blocks": 2.5}}, "n_blocks"),
-        ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization: expected one of"),
+        ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization must be one of"),
         ({"policy_kwargs": {**PAPER, "net_arch": []}}, "at least one hidden layer.*projection"),
         ({"policy_kwargs": {"group": "none"}}, "Pass symmetry_coef=0"),
         ({"prediction_depth": -1}, "prediction_depth must be an integer >= 0( or None)?, got -1"),
@@ -38,9 +38,9 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"tau": None}, "tau must be a finite number"),
         ({"replay_buffer_kwargs": {"alpha": float("nan")}}, "alpha"),
         ({"policy_kwargs": {"latent_hidden_dim": 0}}, "latent_hidden_dim must be an integer >= 1"),
-        ({"policy_kwargs": {"group": 2}}, "expected GL\\(n\\), SE\\(n\\).*found 2"),
+        ({"policy_kwargs": {"group": 2}}, "group must be GL\\(n\\), SE\\(n\\).*got 2"),
         ({"policy_kwargs": {"group": None}}, "Pass symmetry_coef=0"),
-        ({"replay_buffer_class": "x"}, "expected SequenceReplayBuffer"),
+        ({"replay_buffer_class": "x"}, "replay_buffer_class must be SequenceReplayBuffer"),
         ({"replay_buffer_kwargs": {"n_steps": 1}}, "Pass n_steps=1 to EqR"),
         ({"tau": 1.5}, "tau must be a finite number in \\[0, 1\\], got 1.5"),
         ({"aet_coef": -1.0}, "aet_coef must be a finite number >= 0"),
@@ -51,10 +51,10 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"gamma": 1.01}, "gamma"),
         ({"replay_buffer_kwargs": {"alpha": -1.0}}, "alpha"),
         ({"replay_buffer_kwargs": {"beta": 1.4}}, "beta"),
-        ({"batch_size": 1}, "at least 2 samples"),
-        ({"replay_buffer_class": ReplayBuffer}, "expected SequenceReplayBuffer"),
-        ({"policy": QRDQNPolicy}, "expected a policy derived from EqR(QRDQN|Rainbow)Policy"),
-        ({"policy": "MultiInputPolicy"}, "expected a Dict observation space"),
+        ({"batch_size": 1}, "batch_size must be an integer >= 2"),
+        ({"replay_buffer_class": ReplayBuffer}, "replay_buffer_class must be SequenceReplayBuffer"),
+        ({"policy": QRDQNPolicy}, "policy must be derived from EqR(QRDQN|Rainbow)Policy"),
+        ({"policy": "MultiInputPolicy"}, "observation_space must be a Dict space"),
         ({"target_update_interval": 0}, "target_update_interval"),
         ({"policy_kwargs": {"sigma_init": -1.0}}, "sigma_init"),
         ({"policy": "LstmPolicy"}, "LstmPolicy unknown"),
@@ -63,21 +63,21 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"resets": {"initial_n_steps": 0}}, "initial_n_steps must be an integer >= 1"),
         (
             {"resets": {"initial_n_steps": 497}, "buffer_size": 499},
-            "prediction_depth \\+ 1 = 500 transitions per environment, found 499",
+            "prediction_depth \\+ 1 = 500 transitions per environment, got 499",
         ),
         ({"resets": {"initial_gamma": -0.1}}, "initial_gamma must be a finite number in"),
-        ({"resets": {"initial_gamma": 0.9}, "gamma": 1.0}, "initial_gamma: expected it and gamma below 1"),
+        ({"resets": {"initial_gamma": 0.9}, "gamma": 1.0}, "initial_gamma and gamma must be < 1"),
         ({"resets": {"annealing_steps": 0}}, "annealing_steps"),
         ({"resets": {"interval": 0}}, "resets: interval must be an integer >= 1"),
         ({"resets": {"shrink_factor": 1.5}}, "shrink_factor"),
         ({"resets": {"end": -1}}, "resets: end"),
         (
             {"policy_kwargs": {"optimizer_class": "AdamV"}},
-            "optimizer_class: expected a class or a name in torch.optim.*'AdamV'",
+            "optimizer_class must be a class or a name in torch.optim.*'AdamV'",
         ),
         (
             {"policy_kwargs": {"features_extractor_class": "resnet"}},
-            "expected a class or one of \\['nature', 'impala', 'mlp', 'flatten'\\]",
+            "must be a class or one of \\['nature', 'impala', 'mlp', 'flatten'\\]",
         ),
     ],
     ids=str,
@@ -93,10 +93,10 @@ def test_the_minimum_buffer_size_is_per_environment(make):
 
 
 def test_observations_that_are_not_a_frame_stack(make):
-    with pytest.raises(ValueError, match="expected a divisor"):
+    with pytest.raises(ValueError, match="frame_stack must divide"):
         make(ImageEnv((3, 36, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 2})
     model = make(ImageEnv((4, 40, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 4})
-    with pytest.raises(ValueError, match="frame_stack=4: expected each observation"):
+    with pytest.raises(ValueError, match="frame_stack=4: each observation must"):
         model.learn(50)
     assert model.num_timesteps == 1
 
@@ -108,7 +108,7 @@ def test_observations_that_are_not_a_frame_stack(make):
 def test_bad_values_from_the_environment(make, where, what, value, normalize):
     env = make_vec_env(lambda: PoisonEnv(where, value, at=60))
     model = make(VecNormalize(env) if normalize else env)
-    with pytest.raises(ValueError, match=f"step 60: expected finite .*{what}s? from the environment, found (nan|-?inf)"):
+    with pytest.raises(ValueError, match=f"step 60: .*{what}s from the environment must be finite, got (nan|-?inf)"):
         model.learn(100)
     assert model.replay_buffer.size() == 59 and model._n_updates > 0
     if normalize:
@@ -122,7 +122,7 @@ def test_bad_values_from_the_environment(make, where, what, value, normalize):
 def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, where):
     env = VecNormalize(DummyVecEnv([lambda: PoisonEnv(where, at=50)]))
     model = make(env)
-    with pytest.raises(ValueError, match="step 50: expected finite"):
+    with pytest.raises(ValueError, match=r"step 50: .* must be finite"):
         model.learn(60)
     clean = VecNormalize(DummyVecEnv([lambda: PoisonEnv(where, at=1_000)]))
     make(clean).learn(49)
@@ -141,7 +141,7 @@ def test_observations_of_predict_must_be_finite(make, value):
 
 def test_a_bad_first_observation_raises_before_the_first_step(make):
     model = make(PoisonEnv("reset"))
-    with pytest.raises(ValueError, match="step 0: expected finite observations"):
+    with pytest.raises(ValueError, match="step 0: observations from the environment must be finite"):
         model.learn(10)
     assert model.num_timesteps == 0
 
@@ -158,7 +158,7 @@ def test_losses_that_are_not_finite_restore_the_last_good_model(make, trained, t
     model.replay_buffer.rewards[:] = 3e38  # finite, but its square and its double are not
     model.train(gradient_steps=2, batch_size=8)
     assert not all(th.isfinite(p).all() for p in model.policy.parameters())
-    message = f"update {updates + 3}: expected finite losses, found .*reward_loss = inf.* put back to update {updates} "
+    message = f"update {updates + 3}: losses must be finite, got .*reward_loss = inf.* rolled back to update {updates} "
     with pytest.raises(FloatingPointError, match=message):
         model.save(tmp_path / "model")
     after = model.policy.state_dict()
@@ -223,9 +223,7 @@ def test_the_last_update_is_checked_before_learn_returns(make, tmp_path):
                 model.lr_schedule = lambda progress: float("inf")
             return True
 
-    with pytest.raises(
-        FloatingPointError, match=r"step 60, update \d+: expected finite parameters, found (nan|inf)\. The model"
-    ):
+    with pytest.raises(FloatingPointError, match=r"step 60, update \d+: parameters must be finite, got (nan|inf)\. The model"):
         model.learn(60, callback=Callback())
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
     model.save(tmp_path / "model")
@@ -235,7 +233,7 @@ def test_parameters_that_are_not_finite_are_never_saved(make, tmp_path):
     model = make(ChainEnv())
     with th.no_grad():
         next(model.policy.parameters())[0] = float("nan")
-    with pytest.raises(FloatingPointError, match="There is no sound model to put back"):
+    with pytest.raises(FloatingPointError, match="No finite model is left to roll back to"):
         model.save(tmp_path / "model")
     assert list(tmp_path.iterdir()) == []
 
@@ -281,8 +279,8 @@ def test_numbers_of_atoms(algorithm, name):
 @pytest.mark.parametrize(
     "support, message",
     [
-        ({"v_min": 10.0}, "v_min: expected a number below v_max = 10.0, found 10.0"),
-        ({"v_min": 3, "v_max": 1}, "v_min: expected a number below v_max = 1, found 3"),
+        ({"v_min": 10.0}, "v_min must be a finite number < v_max = 10.0, got 10.0"),
+        ({"v_min": 3, "v_max": 1}, "v_min must be a finite number < v_max = 1, got 3"),
         ({"v_max": float("inf")}, "v_max must be a finite number, got inf"),
         ({"v_min": "low"}, "v_min must be a finite number"),
         ({"n_atoms": 1}, "n_atoms must be an integer >= 2"),
@@ -329,7 +327,7 @@ def test_returns_outside_the_support_warn_once(rewards, step, value):
     if step is None:
         assert found == []
     else:
-        assert len(found) == 1 and f"step {step}: a discounted return of {value} was seen" in found[0]
+        assert len(found) == 1 and f"step {step}: a discounted return of {value} lies outside" in found[0]
 
 
 def test_returns_within_the_support_do_not_warn():
@@ -355,7 +353,7 @@ def test_buffer_add_checks_its_arguments(make):
 
 
 def test_a_call_of_learn_without_updates_warns(make):
-    with pytest.warns(UserWarning, match=r"learning_starts=50 is not below the last step, 50: no update"):
+    with pytest.warns(UserWarning, match=r"learning_starts=50 is not smaller than the last step, 50, so no updates"):
         make(ChainEnv(), learning_starts=50).learn(50)
 
 
@@ -367,14 +365,14 @@ def test_resuming_without_vec_normalize_or_replay_buffer_warns(make, tmp_path):
     with pytest.warns(UserWarning) as caught:
         bare.learn(5)
     said = " ".join(str(warning.message) for warning in caught)
-    assert "trained behind VecNormalize" in said and "The replay buffer is empty, but this agent has made" in said
+    assert "trained with VecNormalize" in said and "The replay buffer is empty, but this agent has made" in said
 
 
 def test_devices(make):
     with pytest.raises(ValueError, match=r"device must be 'auto' or a device of PyTorch such as .*, got 'nodevice'"):
         make(ChainEnv(), device="nodevice")
     if not th.cuda.is_available():
-        with pytest.warns(UserWarning, match="finds no GPU, cuda:0 was asked for"):
+        with pytest.warns(UserWarning, match="cuda:0 was requested, but PyTorch finds no GPU"):
             make(ChainEnv(), device="cuda:0")
 
 
@@ -388,7 +386,7 @@ def test_resuming_with_a_new_vec_normalize_warns(make, tmp_path):
     model.learn(60)
     model.save(tmp_path / "model")
     new = type(model).load(tmp_path / "model", VecNormalize(make_vec_env(ChainEnv)), force_reset=False)
-    with pytest.warns(UserWarning, match="trained behind VecNormalize, and that VecNormalize is new"):
+    with pytest.warns(UserWarning, match="trained with VecNormalize, but this VecNormalize has no statistics"):
         new.learn(5)
 
 

@@ -283,7 +283,7 @@ def test_rounds_without_updates_keep_the_last_good_model(make):
     model = wait_for_a_longer_window(make)
     with th.no_grad():
         next(model.policy.online.features_extractor.parameters()).fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match=r"found nan\. The model was put back to update 2 "):
+    with pytest.raises(FloatingPointError, match=r"got nan\. The model was rolled back to update 2 "):
         model.learn(8, reset_num_timesteps=False)
     assert all(th.isfinite(p).all() for p in model.policy.parameters()) and model._resets.done == []
     model.learn(40, reset_num_timesteps=False)
@@ -343,7 +343,7 @@ def test_a_bad_update_right_after_a_reset_reverts_the_reset(make, monkeypatch):
     monkeypatch.setattr(model._monitor, "add", poisoned)
     model.train(gradient_steps=2, batch_size=8)
     assert model._resets.done == [40]
-    with pytest.raises(FloatingPointError, match=r"update 42: .*put back to update 40 "):
+    with pytest.raises(FloatingPointError, match=r"update 42: .*rolled back to update 40 "):
         model.dump_logs()
     assert model._resets.done == [] and model._n_updates == 40
     assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
@@ -386,7 +386,7 @@ def test_the_interval_of_backups():
 
     for n_updates in (0, 20, 40, 60, 80, 100, 120):
         assert round_of_updates(n_updates, 1.0) == {"loss": 1.0}
-    with pytest.raises(FloatingPointError, match=r"update 160: .*put back to update 120 "):
+    with pytest.raises(FloatingPointError, match=r"update 160: .*rolled back to update 120 "):
         round_of_updates(140, float("nan"))
     assert layer.weight.item() == 120
 
@@ -466,7 +466,7 @@ def test_custom_filters():
     space = ImageEnv((4, 84, 84)).observation_space
     extractor = ConvExtractor(space, layers=[[32, 5, 5], [64, 5, 5]])
     assert extractor.features_dim == 64 * 3 * 3
-    with pytest.raises(ValueError, match="at least 25x25 pixels, found 24x24"):
+    with pytest.raises(ValueError, match="at least 25x25 pixels, got 24x24"):
         ConvExtractor(ImageEnv((4, 24, 24)).observation_space, layers=[[32, 5, 5], [64, 5, 5]])
 
 

@@ -92,7 +92,7 @@ def test_without_q_learning_the_head_is_neither_trained_nor_logged(make):
     model = make(ChainEnv(), td_coef=0.0, policy_kwargs={"projection": "own"})
     head = [p.clone() for p in model.policy.online.head.parameters()]
     encoder = [p.clone() for p in model.policy.online.features_extractor.parameters()]
-    model.learn(46)
+    model.learn(46, log_interval=None)
     assert all(th.equal(p, q) for p, q in zip(model.policy.online.head.parameters(), head, strict=True))
     assert not any(th.equal(p, q) for p, q in zip(model.policy.online.features_extractor.parameters(), encoder, strict=True))
     logged = model.logger.name_to_value
@@ -103,7 +103,7 @@ def test_without_q_learning_the_head_is_neither_trained_nor_logged(make):
 def test_weight_of_the_td_loss(make):
     """The loss is the weighted sum of its terms."""
     model = make(ChainEnv(), td_coef=0.5, aet_coef=2.0, prioritized_replay=False)
-    model.learn(41)
+    model.learn(41, log_interval=None)
     logged = {
         name: model.logger.name_to_value[f"train/{name}"]
         for name in ("loss", "td_loss", "aet_loss", "symmetry_loss", "reward_loss")
@@ -154,11 +154,11 @@ def test_invalid_arguments():
         EqRQRDQN("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "mine"})
     with pytest.raises(ValueError, match="td_coef must be a finite number >= 0"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=-1)
-    with pytest.raises(ValueError, match="td_coef: expected a weight above 0 where no auxiliary loss is on"):
+    with pytest.raises(ValueError, match="td_coef must be > 0 if all auxiliary losses are disabled"):
         EqRQRDQN("MlpPolicy", ChainEnv(), td_coef=0, prediction_depth=0)
-    with pytest.raises(ValueError, match="whiten: expected a group"):
+    with pytest.raises(ValueError, match="group must not be None if whiten=True"):
         EqRQRDQN("MlpPolicy", ChainEnv(), symmetry_coef=0, policy_kwargs={"group": None, "whiten": True})
-    with pytest.raises(ValueError, match=r"total_timesteps: expected more than .* = 3500, found 3000"):
+    with pytest.raises(ValueError, match=r"total_timesteps must be > .* = 3500, got 3000"):
         train_representation(Ring(), "SO(2)", policy="MlpPolicy", total_timesteps=3_000)
 
 

@@ -232,14 +232,14 @@ def test_a_file_of_another_class(make, tmp_path):
         algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
         for trust in (False, True):  # the error must not suggest trusting a file that cannot be loaded
             with pytest.raises(
-                ValueError, match=r"stock: expected a file of EqR\w+\.save, found an agent whose policy is of \S+qn"
+                ValueError, match=r"stock must be a file written by EqR\w+\.save, got an agent with a policy of \S+qn"
             ):
                 make.algorithm.load(tmp_path / "stock", env=ChainEnv(), trust=trust)
 
 
 def test_the_agents_reject_each_others_files(tmp_path):
     EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "quantiles")
-    with pytest.raises(ValueError, match=r"expected a policy derived from EqRRainbowPolicy, found .*EqRQRDQNPolicy"):
+    with pytest.raises(ValueError, match=r"policy must be derived from EqRRainbowPolicy, got .*EqRQRDQNPolicy"):
         EqRRainbow.load(tmp_path / "quantiles")
 
 
@@ -248,7 +248,9 @@ def test_parameters_for_another_support(tmp_path):
     model = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs)
     model.save(tmp_path / "model")
     other = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs, policy_kwargs={"v_max": 100.0})
-    with pytest.raises(ValueError, match=r"support: expected .* '\[-10.0, 100.0\]', found parameters for '\[-10.0, 10.0\]'"):
+    with pytest.raises(
+        ValueError, match=r"support: parameters must be for '\[-10.0, 100.0\]', got parameters for '\[-10.0, 10.0\]'"
+    ):
         other.set_parameters(str(tmp_path / "model"))
     other.save(tmp_path / "other")
     loaded = EqRRainbow.load(tmp_path / "other")
@@ -263,12 +265,12 @@ def test_parameters_of_another_group(make, tmp_path):
     model.save(tmp_path / "model")
     for wrong in (other, twisted):
         before = {name: p.clone() for name, p in wrong.policy.state_dict().items()}
-        with pytest.raises(ValueError, match=r"group: expected parameters for .*, found parameters for 'SE\(2\)\^4, euler'"):
+        with pytest.raises(ValueError, match=r"group: parameters must be for .*, got parameters for 'SE\(2\)\^4, euler'"):
             wrong.set_parameters(str(tmp_path / "model"))
         assert equal_states(before, wrong.policy.state_dict())
     with pytest.raises(ValueError, match="policy kwargs"):
         make.algorithm.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
-    with pytest.raises(ValueError, match="found parameters for 'SE"):
+    with pytest.raises(ValueError, match="got parameters for 'SE"):
         make.algorithm.load(tmp_path / "model", custom_objects={"policy_kwargs": other.policy_kwargs})
 
 
@@ -283,7 +285,7 @@ def test_truncated_files(make, share, tmp_path):
     with pytest.raises(ValueError, match="truncated"):
         make.algorithm.load(tmp_path / "model")
     buffer = model.replay_buffer
-    with pytest.raises(ValueError, match="expected a complete replay buffer saved by"):
+    with pytest.raises(ValueError, match="must be a complete replay buffer written by"):
         model.load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer is buffer
 
@@ -317,7 +319,7 @@ def test_a_buffer_from_a_different_step_warns(make, tmp_path):
         warnings.simplefilter("error")
         model.load_replay_buffer(tmp_path / "buffer")
     model.learn(4, reset_num_timesteps=False)
-    with pytest.warns(UserWarning, match="saved at step 46, and the model is of step 50"):
+    with pytest.warns(UserWarning, match="saved at step 46, but the model is at step 50"):
         model.load_replay_buffer(tmp_path / "buffer")
 
 
@@ -369,12 +371,12 @@ def test_files_that_are_not_replay_buffers_of_this_package(make, tmp_path):
     other_kind = EqRRainbow if make.algorithm is EqRQRDQN else EqRQRDQN
     other_kind("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "relative")
     for name in ("stock", "images", "relative"):
-        with pytest.raises(ValueError, match=r"expected a (complete )?replay buffer"):
+        with pytest.raises(ValueError, match=r"must be a (complete )?replay buffer"):
             model.load_replay_buffer(tmp_path / name, trust=True)
         assert model.replay_buffer.size() == 46
     for other in ({"prioritized_replay": False}, {"replay_buffer_kwargs": {"alpha": 0.9}}):
         make(ChainEnv(), **other).save_replay_buffer(tmp_path / "other")
-        with pytest.raises(ValueError, match=r"expected a (complete )?replay buffer"):
+        with pytest.raises(ValueError, match=r"must be a (complete )?replay buffer"):
             model.load_replay_buffer(tmp_path / "other")
 
 

@@ -66,11 +66,11 @@ def test_frozen_networks_survive_training_saving_and_resets(make, tmp_path):
 @pytest.mark.parametrize(
     "changes, found",
     [
-        ({"n_blocks": 4}, "group: expected parameters for 'SE\\(2\\)\\^4, euler', found"),
-        ({"group": "T(9)", "n_blocks": 1}, "group: expected parameters for 'T\\(9\\)\\^1, euler', found"),
-        ({"latent_hidden_dim": 8}, "load_representation: expected.*transition"),
-        ({"state_dependent_actions": False}, "load_representation: expected.*transition"),
-        ({"parameterization": "exp"}, "expected.*SE\\(2\\)\\^3, exp', found parameters for 'SE\\(2\\)\\^3, euler'"),
+        ({"n_blocks": 4}, "group: parameters must be for 'SE\\(2\\)\\^4, euler', got"),
+        ({"group": "T(9)", "n_blocks": 1}, "group: parameters must be for 'T\\(9\\)\\^1, euler', got"),
+        ({"latent_hidden_dim": 8}, "load_representation: transition.* must be the same"),
+        ({"state_dependent_actions": False}, "load_representation: transition.* must be the same"),
+        ({"parameterization": "exp"}, "must be for 'SE\\(2\\)\\^3, exp', got parameters for 'SE\\(2\\)\\^3, euler'"),
         ({"whiten": True}, "missing"),
     ],
 )
@@ -87,7 +87,7 @@ def test_a_different_kind_of_file(tmp_path):
     from sb3_contrib import QRDQN as Stock
 
     Stock("MlpPolicy", ChainEnv(), device="cpu").save(tmp_path / "stock")
-    with pytest.raises(ValueError, match="expected a file of EqRQRDQN or EqRRainbow"):
+    with pytest.raises(ValueError, match="must be a file of EqRQRDQN or EqRRainbow"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "stock")
     for algorithm in (EqRQRDQN, EqRRainbow):
         with pytest.raises(FileNotFoundError):
@@ -106,9 +106,9 @@ def test_frozen_networks_can_be_unfrozen(make, tmp_path):
 
 def test_files_that_are_not_agents(tmp_path):
     (tmp_path / "cut.zip").write_bytes(b"PK")
-    with pytest.raises(ValueError, match="expected a whole file"):
+    with pytest.raises(ValueError, match="must be a complete file"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
-    with pytest.raises(ValueError, match="freeze: expected a loss"):
+    with pytest.raises(ValueError, match="freeze must be False"):
         QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
 
 

@@ -1,4 +1,4 @@
-"""docs/design.md names files and code that exist, and every module of ``sb3_eqr.common``."""
+"""docs/design.md names every module of ``sb3_eqr.common``, and the files and code that it names exist."""
 
 import ast
 import pathlib
@@ -14,7 +14,7 @@ def section(title):
 
 
 def defined(node, prefix=""):
-    """Dotted names of classes, functions, and what is assigned or annotated in modules and classes."""
+    """Dotted names of classes and functions, and of variables of modules and classes."""
     for child in node.body:
         if isinstance(child, (ast.ClassDef, ast.FunctionDef)):
             yield prefix + child.name
@@ -32,7 +32,7 @@ def test_every_module_has_a_line_in_the_tree():
     assert sorted(listed) == sorted(name for name in modules if not name.endswith("__init__.py"))
 
 
-def test_what_the_page_names_is_there():
+def test_everything_named_on_the_page_exists():
     sources = [path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")]
     names = {name for source in sources for name in defined(ast.parse(source))}
     words = {word for source in sources for word in re.findall(r"\w+", source)}

@@ -1,10 +1,10 @@
 """
-README and docs/ say what is true: Python blocks run, command lines are understood, files fit, nothing escapes.
+README and docs/ are correct: Python blocks run, command lines can be parsed, files are valid, and every block is tested.
 
-Blocks are found by sybil; those of one page share a namespace, in the order of the page, in an empty folder. So that a
-page takes seconds, ``learn`` does 20 steps instead of what it is asked for and learns from the 16th on, at least every fourth
-step, by at most two updates; a PPO rollout has 8 steps, a game of Atari ends after 40 steps and an evaluation after one
-episode (see ``shortened``). Nothing else is replaced.
+Sybil finds the blocks. Those of one page share a namespace and run in the order of the page, in an empty folder. So that a
+page takes seconds, ``learn`` does 20 steps and learns from the 16th on, at least every fourth step, with at most two updates;
+a PPO rollout has 8 steps, a game of Atari ends after 40 steps and an evaluation after one episode (see ``shortened``).
+Nothing else is replaced.
 """
 
 import argparse
@@ -49,7 +49,7 @@ def name_of(page):
     return str(page.relative_to(ROOT))
 
 
-# --- what a block may be -------------------------------------------------------------------------------------------------
+# --- kinds of blocks -----------------------------------------------------------------------------------------------------
 
 
 def check_sh(example):
@@ -58,7 +58,7 @@ def check_sh(example):
 
 
 def check_yaml(example):
-    """An entry of hyperparameters has ``policy``, a suite has ``games``."""
+    """Hyperparameters have the key ``policy``, suites the key ``games``."""
     for name, entry in yaml.safe_load(example.parsed).items():
         if "games" in entry:
             make_suite(name, "docs", entry)
@@ -67,11 +67,11 @@ def check_yaml(example):
 
 
 def check_text(example):
-    """Output, folders, a drawing: read by people only."""
+    """Output, folders, drawings: not checked."""
 
 
 def check_eval_rst(example):
-    """What autodoc is to show is there, with a docstring."""
+    """Everything that autodoc shows exists and has a docstring."""
     for kind, name, options in re.findall(r"^\.\. auto(\w+):: (\S+)\n((?: +:.*\n)*)", f"{example.parsed}\n", re.M):
         module, _, attribute = name.rpartition(".")
         found = importlib.import_module(name) if kind == "module" else getattr(importlib.import_module(module), attribute)
@@ -81,11 +81,11 @@ def check_eval_rst(example):
 
 
 def check_literalinclude(example):
-    """See test_includes.py."""
+    """Checked by test_includes.py."""
 
 
 def check_pages(example):
-    """Every page of a table of contents is there."""
+    """Every page of a table of contents exists."""
     folder = pathlib.Path(example.path).parent
     for line in example.parsed.splitlines():
         path = re.sub(r".* <(.*)>$", r"\1", line)  # Title <path>
@@ -114,10 +114,10 @@ BLOCKS = {
 
 
 def every_fence(document):
-    """Sybil's parser: any block between fences, with the evaluator of its language or directive."""
+    """A parser for Sybil: every fenced block, with the evaluator of its language or directive."""
     for region in RawFencedCodeBlockLexer(re.compile(r"(?P<info>.*)$\n", re.M))(document):
         language = (region.lexemes["info"].split() or [""])[0]
-        assert language in BLOCKS, f"{document.path}: no test knows what to do with a block of {language!r}"
+        assert language in BLOCKS, f"{document.path}: BLOCKS has no check for blocks of {language!r}"
         region.parsed = region.lexemes["source"]
         region.evaluator = BLOCKS[language]
         yield region
@@ -135,12 +135,12 @@ def without_blocks(text):
 
 
 class Understood(Exception):
-    """Raised where a command has parsed its arguments and would begin to work."""
+    """Raised when a command has parsed its arguments and would start its work."""
 
 
 def command_lines(text):
     """
-    :return: the words of each line, without comments and variables of the environment
+    :return: the words of each line, without comments and environment variables
     """
     for line in text.replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
@@ -151,7 +151,7 @@ def command_lines(text):
 
 
 def check_command(words):
-    """Fail unless the program that the words call understands the others."""
+    """Fail unless the program, which is the first word, can parse the other words."""
     program, arguments = words[0], words[1:]
     if program == "pip":
         check_pip(arguments)
@@ -167,7 +167,7 @@ def check_command(words):
         assert pathlib.Path(words[1]).parent.name == "examples", words
         check_script(lambda: runpy.run_path(str(ROOT / words[1]), run_name="__main__"), words[2:])
     else:
-        raise AssertionError(f"{program}: no test knows this command")
+        raise AssertionError(f"there is no check for the command {program}")
 
 
 def check_pip(arguments):
@@ -191,19 +191,19 @@ def check_make(arguments):
 
 
 def check_sb3_eqr(arguments):
-    args = check_script(cli.main, arguments)  # of RL Zoo's commands also names, files and hyperparameters
+    args = check_script(cli.main, arguments)  # RL Zoo's commands also check names, files and hyperparameters
     if arguments[:2] == ["benchmark", "run"] and args.suite is not None:
         if args.suite_file is None:
             choose(load_suite(args.suite), args.games, args.steps)
         for agent in args.agents:
-            if not agent.endswith(".yml"):  # a file of the reader's
+            if not agent.endswith(".yml"):  # such a file is the reader's
                 find_agent(agent)
 
 
 def check_script(call, arguments):
     """
-    :param call: what runs it, to where its real parser has parsed
-    :return: what it has parsed
+    :param call: runs the script, which is stopped when it has parsed its arguments
+    :return: the parsed arguments
     """
     with pytest.MonkeyPatch.context() as patch:
         parse_args = argparse.ArgumentParser.parse_args
@@ -215,7 +215,7 @@ def check_script(call, arguments):
         patch.setattr(zoo_command, "check_trained", lambda args: None)  # nothing is trained here
         patch.setattr(zoo_command, "check_trained_agent", lambda path: None)
         patch.setattr(zoo_command, "check_runs", lambda arguments: None)
-        for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # replaced for good by a command
+        for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # commands replace them for good
             patch.setattr(module, name, getattr(module, name))
         patch.setattr("huggingface_sb3.push_to_hub.generate_metadata", None, raising=False)
         patch.setattr(sb3_eqr.zoo.hub, "provide_ffmpeg", lambda: None)
@@ -223,11 +223,11 @@ def check_script(call, arguments):
         patch.setattr(sys, "argv", ["command", *arguments])
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # runpy's, of modules that are imported already
+                warnings.simplefilter("ignore")  # runpy warns about modules that are already imported
                 call()
         except Understood as understood:
             return understood.args[0]
-        assert not arguments  # it takes none, and has done its work
+        assert not arguments  # a script without arguments has run completely
         return None
 
 
@@ -236,12 +236,13 @@ def check_script(call, arguments):
 
 @pytest.fixture
 def shortened(monkeypatch, tmp_path):
-    """Training and evaluation of seconds; what the pages read is there."""
+    """Training and evaluation take seconds, and the files that the pages read exist."""
     setup_learn, evaluate = BaseAlgorithm._setup_learn, stable_baselines3.common.evaluation.evaluate_policy
 
     def setup_short_learn(self, total_timesteps, *args, **kwargs):
         if isinstance(self, OffPolicyAlgorithm):
-            self.learning_starts = min(self.learning_starts, LEARNING_STARTS)
+            starts = self.learning_starts  # None: an EqR agent's default
+            self.learning_starts = LEARNING_STARTS if starts is None else min(starts, LEARNING_STARTS)
             self.gradient_steps = min(self.gradient_steps, GRADIENT_STEPS)
             self.train_freq = self.train_freq._replace(frequency=min(self.train_freq.frequency, TRAIN_FREQ))
         return setup_learn(self, min(total_timesteps, STEPS), *args, **kwargs)
@@ -268,7 +269,7 @@ def shortened(monkeypatch, tmp_path):
 
 
 def write_a_benchmark(folder):
-    """One finished run, as far as ``load_scores`` reads it."""
+    """One finished run, with the fields that ``load_scores`` reads."""
     evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
     training = {"step": [100], "score": [100.0], "length": [100]}
     names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}
@@ -284,8 +285,8 @@ def test_every_block(page, shortened):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_no_block_escapes(page):
-    """Counted without sybil: as many blocks as pairs of fences, and none that is code by its indentation only."""
+def test_no_block_is_missed(page):
+    """Counted without Sybil, there are as many blocks as pairs of fences, and no indented code blocks."""
     text = page.read_text(encoding="utf-8")
     fences = re.findall(r"^\s*(?:[-*+>]\s*)*(?:```|~~~|:::)", text, re.M)
     assert len(fences) == 2 * len(examples_of(page))
@@ -293,7 +294,7 @@ def test_no_block_escapes(page):
 
 
 def test_commands_within_sentences_and_tables():
-    """`sb3-eqr train ...` in a line of text, where it is whole: no placeholders."""
+    """Complete commands such as `sb3-eqr train ...` within a line of text, without placeholders."""
     text = "\n".join(without_blocks(page.read_text(encoding="utf-8")) for page in PAGES)
     spans = re.findall(r"`((?:[A-Z_]+=\S+ )?(?:sb3-eqr [a-z]\w* -|python examples/|python -m |make |pip )[^`]*)`", text)
     whole = [span for span in spans if not re.search(r"\.\.\.|\[FOLDER|\bCOMMAND\b|sb3_eqr\.zoo$", span)]
@@ -304,8 +305,8 @@ def test_commands_within_sentences_and_tables():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_links_lead_somewhere(page):
-    """Relative ones, on GitHub as in Sphinx: to a file, and to a heading of it."""
+def test_relative_links_exist(page):
+    """Relative links, as on GitHub and in Sphinx: to a file, and to a heading in it."""
     text = without_blocks(page.read_text(encoding="utf-8"))
     for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text):
         path, _, anchor = target.partition("#")
@@ -316,7 +317,7 @@ def test_links_lead_somewhere(page):
             assert anchor in [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings], target
 
 
-STORY = [  # lines of the pages, in an order that works, and what shortens them: of an argument given twice the last one counts
+STORY = [  # lines of the pages in a working order, and arguments that shorten them by overriding earlier ones
     ("sb3-eqr train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 5000", "-n 400 --eval-freq 200 --eval-episodes 2"),
     ("sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render", "-n 50"),
     ("sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn qrdqn:stock --seeds 2", "--steps 300 --seeds 1"),
@@ -333,7 +334,7 @@ STORY = [  # lines of the pages, in an order that works, and what shortens them:
 
 
 @pytest.mark.slow
-def test_commands_really_run(tmp_path):
+def test_commands_run(tmp_path):
     text = "\n".join(example.parsed for page in PAGES for example in examples_of(page) if example.region.evaluator is check_sh)
     written = list(command_lines(text))
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -356,6 +357,6 @@ def test_commands_really_run(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_pages_are_built_without_warnings(tmp_path):
+def test_the_pages_build_without_warnings(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", str(DOCS), str(tmp_path / "html")]
     subprocess.run([*command, "-d", str(tmp_path / "doctrees")], check=True, timeout=300)

@@ -1,8 +1,8 @@
 """
-Each ``literalinclude`` of the pages shows the code that its text is about.
+Each ``literalinclude`` of the pages shows the code that the text before it describes.
 
-Sphinx's own reader reads the code. ``PROMISES`` says, for each include, which phrases the code must have and which names
-the text before it must mention.
+The code is read with Sphinx's reader. For each include, ``PROMISES`` has the phrases that the code must contain and the names
+that the text before it must mention.
 """
 
 import ast
@@ -25,15 +25,15 @@ INCLUDE = re.compile(r"^```\{literalinclude\} (\S+)\n(.*?)^```$", re.M | re.S)
 class Include(NamedTuple):
     """A ``literalinclude`` of a page."""
 
-    target: str  # what PROMISES calls it: the file within the repository, and the object or the first line
-    lead: str  # the text between the heading or block before it and this one
+    target: str  # its key in PROMISES: the file within the repository, and the object or the first line
+    lead: str  # the text since the previous heading or block
     code: str
 
 
 class Promise(NamedTuple):
-    """What the reader of a page expects of an include."""
+    """What an include and the text before it must contain."""
 
-    code: tuple[str, ...]  # phrases of the included code; no other include of the page has them all
+    code: tuple[str, ...]  # phrases of the code; no other include of the page contains all of them
     text: tuple[str, ...]  # phrases of the text before it
 
 
@@ -143,9 +143,9 @@ def name_of(page):
 
 def includes_of(text, page):
     """
-    :param text: of the page
-    :param page: where it lies, for relative paths
-    :raises ValueError: by Sphinx, where the object or the line is not in the file
+    :param text: content of the page
+    :param page: path of the page, to resolve relative paths
+    :raises ValueError: if Sphinx does not find the object or the line in the file
     """
     found = []
     for match in INCLUDE.finditer(text):
@@ -155,7 +155,7 @@ def includes_of(text, page):
             options["dedent"] = int(options["dedent"])
         path = (page.parent / match[1]).resolve()
         code, _ = LiteralIncludeReader(str(path), options, SimpleNamespace(source_encoding="utf-8")).read()
-        assert len(ast.parse(code).body) == 1, f"{match[0]}: one function or statement, from its first line to its last"
+        assert len(ast.parse(code).body) == 1, f"{match[0]} must include exactly one complete function or statement"
         what = options.get("pyobject") or options.get("start-at", "")
         lead = re.split(r"^(?:#+ .*|```)$", text[: match.start()], flags=re.M)[-1]
         found.append(Include(f"{path.relative_to(ROOT)}, {what}", lead, code))
@@ -163,10 +163,10 @@ def includes_of(text, page):
 
 
 def check(text, page, promises):
-    """Fail unless the includes of a page are those of the table and keep what it promises."""
+    """Fail unless the page has exactly the includes of the table, and they keep its promises."""
     includes = includes_of(text, page)
     assert [include.target for include in includes] == list(promises)
-    assert text.count("{literalinclude}") == len(includes)  # none in another spelling
+    assert text.count("{literalinclude}") == len(includes)  # none is missed by the pattern
     for include in includes:
         promise = promises[include.target]
         for phrase in promise.code:
@@ -177,12 +177,12 @@ def check(text, page, promises):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_includes_show_what_the_text_is_about(page):
+def test_includes_show_what_the_text_describes(page):
     check(page.read_text(encoding="utf-8"), page, PROMISES.get(name_of(page), {}))
 
 
-def test_a_promise_is_kept_by_one_include_only():
-    """Otherwise an include could show another function and nobody would notice."""
+def test_each_promise_matches_one_include_only():
+    """Otherwise an include could show a different function unnoticed."""
     for name, promises in PROMISES.items():
         page = DOCS / name
         code_of = {include.target: include.code for include in includes_of(page.read_text(encoding="utf-8"), page)}
@@ -190,7 +190,7 @@ def test_a_promise_is_kept_by_one_include_only():
             assert [other for other, code in code_of.items() if all(phrase in code for phrase in promise.code)] == [target]
 
 
-TAMPERED = {  # what goes wrong with a page -> a replacement in it, what it raises
+TAMPERED = {  # error in a page -> the replacement that makes it, what it raises
     "another function": ("pyobject: reward_mse", "pyobject: normalized_distance", AssertionError),
     "a function that is gone": ("pyobject: _Rollout.forward", "pyobject: LatentModel.unroll", ValueError),
     "a line that is gone": ("start-at: if project is not None and", "start-at: if project is not nothing:", ValueError),
@@ -204,7 +204,7 @@ TAMPERED = {  # what goes wrong with a page -> a replacement in it, what it rais
 
 
 @pytest.mark.parametrize("old, new, error", TAMPERED.values(), ids=TAMPERED)
-def test_what_goes_wrong_is_found(old, new, error):
+def test_errors_in_pages_are_found(old, new, error):
     page = DOCS / "losses.md"
     text = page.read_text(encoding="utf-8")
     assert old in text

@@ -41,7 +41,7 @@ def files(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def cluster():
-    """The address of a Ray cluster: a machine of one CPU."""
+    """The address of a Ray cluster with one CPU."""
     started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     yield started.address
     started.shutdown()
@@ -64,7 +64,7 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     code, out = sb3_eqr(f"{line} --games cartpole --seeds 1")
     assert code == 0 and "qrdqn:fast, CartPole, seed 0: finished" in out.out
     before = {path: path.stat().st_mtime for path in files.glob("b/runs/*/*/*/result.json")}
-    code, out = sb3_eqr(f"{line} --seeds 2 --address {cluster}")  # more seeds, and the other game
+    code, out = sb3_eqr(f"{line} --seeds 2 --address {cluster}")  # more seeds and another game
     assert code == 0 and "2 of 8 runs are already finished." in out.out and "CartPole, seed 0: finished" not in out.out
     results = {path: json.loads(path.read_text()) for path in files.glob("b/runs/*/*/*/result.json")}
     assert len(results) == 8 and all(path.stat().st_mtime == time for path, time in before.items())
@@ -78,7 +78,7 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     expected = {(a, g, s): {30: 1, 60: 2} for a in ("dqn:fast", "qrdqn:fast") for g in ("CartPole", "Acrobot") for s in (0, 1)}
     assert counts.droplevel("kind").to_dict() == {(*run, step): n for run, row in expected.items() for step, n in row.items()}
     assert read_suite(files / "b" / "suite.yml").games == ["CartPole", "Acrobot"]
-    code, out = sb3_eqr("run b")  # nothing is left
+    code, out = sb3_eqr("run b")  # no run is left
     assert code == 0 and "8 of 8 runs are already finished." in out.out
 
 
@@ -86,7 +86,7 @@ BROKEN = f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 4, max_grad_
 
 
 @pytest.mark.slow
-def test_ray_tries_a_run_that_crashes_twice_while_the_others_go_on(files, sb3_eqr, cluster):
+def test_ray_tries_a_crashed_run_twice_while_the_others_continue(files, sb3_eqr, cluster):
     pathlib.Path("broken.yml").write_text(BROKEN)
     line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
     line += f" --address {cluster}"
@@ -108,7 +108,7 @@ class Crash(RayError):
 
 
 class InOneProcess:
-    """In the place of Ray: a run is done in this process when its outcome is asked for."""
+    """Replaces Ray: does a run in this process when its result is requested."""
 
     exceptions = SimpleNamespace(RayError=RayError)
 
@@ -125,7 +125,7 @@ class InOneProcess:
             raise Crash(error) from error
 
 
-def test_a_run_that_crashes_is_tried_twice_and_reported_while_the_others_go_on(files, sb3_eqr, capfd):
+def test_a_crashed_run_is_tried_twice_and_reported_while_the_others_continue(files, sb3_eqr, capfd):
     (files / "broken.yml").write_text(BROKEN)
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
 
@@ -184,27 +184,27 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("report b --reference x", "--reference must be NAME=FILE, got 'x'"),
     ],
 )
-def test_wrong_use_is_told(files, sb3_eqr, line, message):
+def test_wrong_use_prints_an_error(files, sb3_eqr, line, message):
     code, out = sb3_eqr(line)
     assert code == 2 and message in out.err and "Traceback" not in out.err
 
 
 @pytest.mark.slow
-def test_runs_that_no_machine_can_hold_are_told(files, sb3_eqr, cluster):
+def test_runs_that_need_too_many_cpus_print_an_error(files, sb3_eqr, cluster):
     code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --address {cluster}")
     assert code == 2 and "--cpus-per-run must be <= 1, the CPUs of the largest machine, got 2" in out.err
 
 
-def test_a_cluster_that_does_not_answer_is_told(files, sb3_eqr):
+def test_an_unreachable_cluster_prints_an_error(files, sb3_eqr):
     code, out = sb3_eqr(f"{RUN} --seeds 1 --address 127.0.0.1:1")
     assert code == 2 and "127.0.0.1:1" in out.err
 
 
-def test_other_settings_do_not_go_into_the_same_folder(files):
+def test_runs_with_different_settings_cannot_share_a_folder(files):
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
     benchmark_plan = plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
     write_plan(files / "b", suite, benchmark_plan)
-    plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)  # nothing has begun yet
+    plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)  # no run has started yet
     (benchmark_plan[0].folder / "result.json").write_text("{}")
     with pytest.raises(ValueError, match="steps must be 60, as when the run was started, got 70"):
         plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)
@@ -215,13 +215,13 @@ def test_other_settings_do_not_go_into_the_same_folder(files):
         write_plan(files / "b", load_suite("smoke"), [])
 
 
-def test_ray_that_is_missing_is_told(files, sb3_eqr, monkeypatch):
+def test_missing_ray_prints_an_error(files, sb3_eqr, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     code, out = sb3_eqr(RUN)
     assert code == 2 and 'benchmark run needs Ray: pip install ".[benchmark]" in a clone of the repository' in out.err
 
 
-def test_the_script_without_its_extra(monkeypatch):
+def test_the_command_without_its_extra(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["sb3-eqr", "benchmark", "status", "b"])
     monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.commands", raising=False)
     monkeypatch.setitem(sys.modules, "rich.console", None)
@@ -256,7 +256,7 @@ def test_the_script_without_its_extra(monkeypatch):
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
 )
-def test_suites_with_mistakes_are_told(files, change, message):
+def test_invalid_suites_raise(files, change, message):
     (files / "own.yml").write_text(yaml.safe_dump({"tiny": {**SUITE, **change}}))
     with pytest.raises(ValueError, match=message):
         choose(load_suite("tiny", files / "own.yml"), None, None)
@@ -273,7 +273,7 @@ def test_suites_with_mistakes_are_told(files, change, message):
         ),
     ],
 )
-def test_atari_suites_that_do_not_see_whole_games_or_the_same_game_are_told(files, preprocessing, message):
+def test_atari_suites_with_the_wrong_evaluation_environment_raise(files, preprocessing, message):
     entry = {
         **SUITE,
         "env_id": "{game}NoFrameskip-v4",
@@ -288,15 +288,15 @@ def test_atari_suites_that_do_not_see_whole_games_or_the_same_game_are_told(file
 
 
 def test_a_replay_buffer_is_no_larger_than_the_run(files):
-    """QRDQN's own default is 1,000,000: 56 GB of Atari's frames."""
+    """The default of QRDQN is 1,000,000, which is 56 GB of Atari frames."""
     suite = choose(load_suite("smoke"), None, None)
     runs = plan_runs(files / "b", suite, ["qrdqn", "eqr_qrdqn", "dqn:fast.yml", "ppo"], 1)
     assert [run.entry.get("buffer_size") for run in runs] == [3_000, 3_000, 99, None]
 
 
 @pytest.mark.parametrize("cause", [AssertionError(), ValueError("[/tmp/x] [cpu]\nthe [last] line"), None])
-def test_a_crash_without_words_or_with_brackets_does_not_stop_the_others(files, cause, capsys, monkeypatch):
-    """Nor a disk that is too full for the error itself."""
+def test_a_crash_without_message_or_with_brackets_does_not_stop_the_others(files, cause, capsys, monkeypatch):
+    """Nor does a disk that is too full to save the error."""
     runs = plan_runs(files / "b", choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None), ["dqn:fast.yml"], 1)
 
     def get(reference):

@@ -1,4 +1,4 @@
-"""One run of a benchmark: its protocol, its checkpoints, what it writes."""
+"""One run of a benchmark: its protocol, its checkpoints and its files."""
 
 import json
 from types import SimpleNamespace
@@ -49,7 +49,7 @@ def protocol(steps=STEPS, env_id="CartPole-v1", epsilon=0.0, n_envs=2, max_steps
 
 
 def make_run(folder, algo, entry=None, game="CartPole-v1", **kwargs):
-    find_agent(algo)  # registers ours
+    find_agent(algo)  # registers the agents of this package
     entry = yaml.safe_load(f"  {AGENTS[algo] if entry is None else entry}")
     return Run(folder / "run", Agent(algo, algo, folder), "own", game, 3, protocol(env_id=game, **kwargs), entry)
 
@@ -64,7 +64,7 @@ def scores_of(run):
 
 
 def stop_at(monkeypatch, *steps):
-    """Training stops with an exception when it first comes to each of these steps."""
+    """Training stops with an exception when it first reaches each of these steps."""
     ahead = list(steps)
     on_step = training.RunCallback._on_step
 
@@ -77,7 +77,7 @@ def stop_at(monkeypatch, *steps):
 
 
 @pytest.mark.parametrize("algo", AGENTS)
-def test_a_stopped_run_ends_with_the_scores_of_an_undisturbed_one(algo, tmp_path, monkeypatch):
+def test_an_interrupted_run_has_the_scores_of_an_uninterrupted_one(algo, tmp_path, monkeypatch):
     undisturbed = make_run(tmp_path / "undisturbed", algo)
     assert execute(undisturbed, Settings()) == "finished"
     stopped = make_run(tmp_path / "stopped", algo)
@@ -96,7 +96,7 @@ def test_a_stopped_run_ends_with_the_scores_of_an_undisturbed_one(algo, tmp_path
     assert execute(stopped, often) == "finished"
 
 
-def test_what_is_written_beside_the_scores(tmp_path):
+def test_the_contents_of_the_result(tmp_path):
     run = make_run(tmp_path, "eqr_rainbow", points=4)
     execute(run, Settings(command="sb3-eqr benchmark run x"))
     result = result_of(run)
@@ -108,7 +108,7 @@ def test_what_is_written_beside_the_scores(tmp_path):
     ]
     training = result["training"]
     assert training["step"] == np.cumsum(training["length"]).tolist() and training["step"][-1] <= STEPS
-    assert training["score"] == training["length"]  # CartPole, although the agent learns from normalised rewards
+    assert training["score"] == training["length"]  # raw scores of CartPole, although the agent learns from normalised rewards
     assert result["entry"]["hyperparameters"] == run.entry and result["protocol"] == run.protocol
     assert result["versions"]["torch"] and result["machine"]["device"] == "cpu" and result["machine"]["threads"] == 1
     assert result["wall_clock_s"] >= result["training_seconds"] > 0
@@ -116,8 +116,8 @@ def test_what_is_written_beside_the_scores(tmp_path):
     assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "step"} <= result["losses"][-1].keys()
 
 
-def test_evaluations_change_nothing(tmp_path):
-    """Many or few of them: training and the final scores are the same."""
+def test_evaluations_do_not_change_training(tmp_path):
+    """Training and the final scores do not depend on the number of evaluations."""
     few, many = (make_run(tmp_path / str(points), "eqr_rainbow", points=points) for points in (1, 9))
     for run in (few, many):
         execute(run, Settings())
@@ -128,7 +128,7 @@ def test_evaluations_change_nothing(tmp_path):
 
 
 class Corridor(gym.Env):
-    """Episodes last as long as their seed says: the environments of a batch end at different times."""
+    """The seed determines the length of episodes, so the environments of a batch end at different times."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,))
     action_space = gym.spaces.Discrete(2)
@@ -167,15 +167,15 @@ def corridor(monkeypatch):
 
 
 def test_short_episodes_are_not_counted_more_often(corridor):
-    """Ten episodes in two environments: five of 30 steps and five of 3, where the first ten to end would be mostly short."""
+    """Ten episodes in two environments are five of 30 steps and five of 3; the first ten to end would be mostly short."""
     state = np.random.get_state()[1].copy()
     scores, lengths = evaluate(Fixed(), protocol(env_id=corridor), 10, seed=0)
     assert sorted(lengths) == [3] * 5 + [30] * 5 and scores == [0.0] * 10
     assert (np.random.get_state()[1] == state).all()
 
 
-def test_epsilon_and_the_limit_of_steps(corridor):
-    """Random actions are 1 half of the time; nothing else scores."""
+def test_epsilon_and_the_step_limit(corridor):
+    """Half of the random actions are 1, and only they score."""
     limited = protocol(env_id=corridor, epsilon=0.4, max_steps=20)
     scores, lengths = evaluate(Fixed(), limited, 200, seed=0)
     assert set(lengths) == {3, 20}
@@ -184,10 +184,11 @@ def test_epsilon_and_the_limit_of_steps(corridor):
     assert few[0] == few[1] != few[2]
 
 
-def test_evaluations_wait_until_a_reset_is_over(tmp_path):
+def test_evaluations_wait_after_a_reset(tmp_path):
     """
-    From step 48 on two updates follow each round of 8 steps. The round after step 96 starts with the 13th update, before which
-    the network is reset; after three rounds half of the 12 updates to the next reset are done. None is made up for.
+    From step 48 on, two updates follow each round of 8 steps. The round after step 96 starts with the 13th update, before
+    which the network is reset; after three rounds half of the 12 updates to the next reset are done. Skipped evaluations are
+    not made up for.
     """
     run = make_run(tmp_path, "eqr_rainbow", points=20)
     execute(run, Settings())
@@ -195,7 +196,7 @@ def test_evaluations_wait_until_a_reset_is_over(tmp_path):
     assert steps == [*range(8, 97, 8), 96 + 2 * 8 + 1, *range(120, 160, 8)]
 
 
-def test_a_run_that_another_process_has_is_left_alone(tmp_path):
+def test_a_run_locked_by_another_process_is_skipped(tmp_path):
     run = make_run(tmp_path, "dqn")
     run.folder.mkdir(parents=True)
     with FileLock(run.folder / LOCK):
@@ -203,7 +204,7 @@ def test_a_run_that_another_process_has_is_left_alone(tmp_path):
     assert not (run.folder / RESULT).exists()
 
 
-def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monkeypatch):
+def test_a_full_disk_stops_the_run_and_keeps_its_last_checkpoint(tmp_path, monkeypatch):
     undisturbed, full = make_run(tmp_path / "undisturbed", "qrdqn"), make_run(tmp_path / "full", "qrdqn")
     execute(undisturbed, Settings())
     save, calls = training.write_checkpoint, []
@@ -228,13 +229,13 @@ def test_a_full_disk_stops_the_run_with_its_last_checkpoint_whole(tmp_path, monk
 
 
 def atari_protocol(game, n_envs=2, **evaluation):
-    """That of the suite, in fewer environments."""
+    """The protocol of the suite with fewer environments."""
     found = choose(load_suite("atari100k"), [game], None).protocol(game)
     return found | {"evaluation": found["evaluation"] | {"n_envs": n_envs, **evaluation}}
 
 
-def test_atari_is_evaluated_on_whole_games_as_the_paper_does():
-    """The protocol of the suite, beside the environment that the package makes for evaluation."""
+def test_atari_is_evaluated_on_full_games_as_in_the_paper():
+    """The protocol of the suite gives the same environment as ``make_atari100k_env(training=False)``."""
     env = make_evaluation_env(atari_protocol("Boxing"), Fixed(), seed=4)
     plain = make_atari100k_env("Boxing", n_envs=2, seed=4, training=False)
     rng = np.random.default_rng(0)
@@ -248,14 +249,14 @@ def test_atari_is_evaluated_on_whole_games_as_the_paper_does():
     assert np.abs(total).max() > 0
 
 
-def test_an_endless_atari_game_is_counted_when_its_steps_are_over(monkeypatch):
+def test_an_endless_atari_game_is_counted_at_the_step_limit(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 30)
     _, lengths = evaluate(Fixed(), atari_protocol("Boxing", n_envs=1), 2, seed=0)
     assert lengths == [30, 30]
 
 
 class Watching(Fixed):
-    """An agent that notes the observations it was asked about."""
+    """An agent that records the observations it was given."""
 
     def __init__(self):
         self.seen = []
@@ -266,8 +267,8 @@ class Watching(Fixed):
         return super().predict(observation, state, episode_start, deterministic)
 
 
-def test_no_thought_is_given_to_atari_games_that_have_had_their_share():
-    """Random play of Breakout lasts some 120 to 300 steps; the agent is asked once for each step that is counted."""
+def test_no_actions_are_computed_for_atari_games_that_are_done():
+    """Random play of Breakout lasts about 120 to 300 steps; the agent is called once for each counted step."""
     agent, state = Watching(), np.random.get_state()[1].copy()
     scores, lengths = evaluate(agent, atari_protocol("Breakout", epsilon=1.0), 3, seed=0)
     assert len(scores) == len(lengths) == 3 and len(agent.seen) == sum(lengths) and len(set(lengths)) > 1
@@ -283,7 +284,7 @@ def test_the_seed_determines_the_atari_games_that_are_played():
 
 
 class Scripted:
-    """A batch of games of given lengths, over and over; every step scores 1 in the first game, 10 in the second, ..."""
+    """A batch of games of given lengths, repeated; every step scores 1 in the first game, 10 in the second, ..."""
 
     def __init__(self, lengths):
         self.lengths, self.n_envs = np.array(lengths), len(lengths)
@@ -302,7 +303,7 @@ class Scripted:
 
 
 class Recurrent(Fixed):
-    """An agent whose state is the number of steps since the episode began, per game; its action is 7."""
+    """An agent whose state is the number of steps in the episode of each game; its action is 7."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         count = np.zeros(len(observation)) if state is None else state[0]
@@ -335,11 +336,11 @@ def test_a_recurrent_agent_keeps_a_state_for_each_game_of_a_batch():
     assert agent.count.tolist() == [2, 3, 6]  # at the twelfth step
 
 
-def test_which_protocol_an_atari_batch_fits(monkeypatch):
+def test_protocols_that_an_atari_batch_supports(monkeypatch):
     fitting = atari_protocol("Breakout")
     assert fits_atari_batch(fitting, Fixed())
     assert not fits_atari_batch(protocol(), Fixed())
-    assert not fits_atari_batch(fitting | {"env_id": "ALE/Breakout-v5"}, Fixed())  # made with frame skip, sticky actions
+    assert not fits_atari_batch(fitting | {"env_id": "ALE/Breakout-v5"}, Fixed())  # has frame skip and sticky actions
     assert not fits_atari_batch(fitting | {"preprocessing": {"env_kwargs": {"full_action_space": True}}}, Fixed())
     other = fitting["evaluation"] | {"preprocessing": {"env_wrapper": "my.Wrapper", "frame_stack": 4}}
     assert not fits_atari_batch(fitting | {"evaluation": other}, Fixed())
@@ -352,15 +353,15 @@ def test_which_protocol_an_atari_batch_fits(monkeypatch):
     assert not fits_atari_batch(fitting, Fixed())
 
 
-def test_atari_is_evaluated_without_a_batch_where_ale_has_none(monkeypatch):
+def test_atari_is_evaluated_without_a_batch_if_ale_has_none(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 40)
     monkeypatch.setattr(evaluation, "has_atari_batch", lambda: False)
     monkeypatch.setattr(evaluation, "AtariBatch", None)
     assert evaluate(Fixed(), atari_protocol("Breakout"), 4, seed=0)[1] == [40] * 4
 
 
-def test_atari_games_are_saved_as_they_stand():
-    """Stacked frames, lives, no-ops to come: a copy from a checkpoint plays on as the game itself does."""
+def test_atari_games_are_saved_in_the_middle():
+    """With stacked frames, lives and pending no-ops, a restored game continues like the original."""
     make = lambda: VecFrameStack(make_vec_env("BreakoutNoFrameskip-v4", 1, seed=1, wrapper_class=Atari100kWrapper), 4)  # noqa: E731
     env, copied = make(), make()
     rng = np.random.default_rng(0)
@@ -378,10 +379,10 @@ def test_atari_games_are_saved_as_they_stand():
         assert all(np.array_equal(mine, other) for mine, other in zip((obs, rewards, dones), others, strict=True))
         assert infos[0]["lives"] == other_infos[0]["lives"]
         lives.append(infos[0]["lives"])
-    assert min(lives) < lives[0] < lives[-1]  # a life was lost, and a new game has begun
+    assert min(lives) < lives[0] < lives[-1]  # a life was lost, and a new game has started
 
 
-def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
+def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
     """LunarLander cannot be saved in the middle of an episode."""
     run = make_run(tmp_path, "dqn", game="LunarLander-v3", steps=300)
     stop_at(monkeypatch, 100)
@@ -395,7 +396,7 @@ def test_box2d_goes_on_from_a_fresh_episode_and_says_so(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(training.RunCallback, "note_progress", lambda self: None)
     execute(run, Settings())
-    assert counts == [pytest.approx(96, abs=10)]  # what it knew of the observations' scale
+    assert counts == [pytest.approx(96, abs=10)]  # the statistics of observations are restored
     result = result_of(run)
     assert not result["resumed_exactly"] and result["resumed_at"] == [96]
     assert result["training"]["step"] and result["evaluations"][-1]["step"] == 300

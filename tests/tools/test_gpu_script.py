@@ -1,4 +1,4 @@
-"""examples/gpu_speed.py runs from start to end without a GPU, so that on one it only has to measure."""
+"""examples/gpu_speed.py also runs completely without a GPU, which tests everything but its measurements."""
 
 import json
 import subprocess
@@ -27,7 +27,7 @@ def test_updates_and_processes_are_compared(tmp_path):
     assert list(found) == ["parameters", *(f"updates_{name}" for name in EQR_AGENTS), "env_steps", "seeds"]
     assert all(table["title"] in shown for table in found.values())
     assert [row["name"] for row in found["parameters"]["rows"]] == list(EQR_AGENTS)
-    for row in found["parameters"]["rows"]:  # on a CPU all three are eager, and eager updates repeat themselves
+    for row in found["parameters"]["rows"]:  # on a CPU all three are eager, and eager updates are deterministic
         assert row["eager_again"] == row["captured"] == 0 and row["capture"] == NO_GPU and row["ok"]
     for name in EQR_AGENTS:
         assert [row["way"] for row in found[f"updates_{name}"]["rows"]] == ["floor", "eager", "captured"]
@@ -47,4 +47,4 @@ def test_a_run_is_resumed(tmp_path):
     first, second, third = rows
     assert first["steps"] == 1 and first["updates"] == 0
     assert second["steps"] == 60 and second["updates"] == 60 and second["seconds"] > first["seconds"]  # 30 steps, two each
-    assert third == second  # nothing was left to do
+    assert third == second  # the run was already finished

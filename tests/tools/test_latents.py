@@ -1,4 +1,4 @@
-"""Play cut into windows: what the agent saw, as it saw it, beside the true state, and nothing left behind."""
+"""Windows of play: the agent's observations with the true states, without side effects."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ BALL = {"group": "SO(2)", "n_blocks": 1, "parameterization": "gram-schmidt", "wh
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_pictures_come_with_their_true_positions(wrapped):
-    """Whatever wrapper is around, across the ends of episodes."""
+def test_images_have_their_true_positions(wrapped):
+    """With any wrapper, and across the ends of episodes."""
     env = make_vec_env("SlidingBall-v0", 2, env_kwargs={"max_episode_steps": 7})
     env = VecTransposeImage(env) if wrapped else env
     model = EqRQRDQN("CnnPolicy", env, buffer_size=100, policy_kwargs=BALL, device="cpu")
@@ -45,10 +45,10 @@ def test_observations_are_normalised_once():
     np.testing.assert_allclose(found[:5], np.concatenate(obs)[:5], rtol=1e-6)
 
 
-def test_the_same_seed_plays_the_same_and_nothing_is_left_behind():
+def test_the_same_seed_plays_the_same_without_side_effects():
     model = EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=200, device="cpu", seed=0)
     env = make_vec_env(ChainEnv, 1, seed=0)
-    model.exploration_rate = 0.5  # random actions are drawn from the action space's own generator
+    model.exploration_rate = 0.5  # random actions use the generator of the action space
     th.manual_seed(5)
     np.random.seed(5)
     model.action_space.seed(5)
@@ -62,14 +62,14 @@ def test_the_same_seed_plays_the_same_and_nothing_is_left_behind():
     assert [model.action_space.sample() for _ in range(9)] == expected[2]
 
 
-def test_atari_can_be_shown_in_colour():
+def test_atari_can_be_rendered_in_colour():
     env = make_atari100k_env("Pong", seed=0, render_mode="rgb_array")
     env.reset()
     assert env.render().shape == (210, 160, 3)
 
 
 class Scalings(Group):
-    """A group of one's own, whose elements are no matrices (docs/groups.md)."""
+    """A custom group whose elements are not matrices (docs/groups.md)."""
 
     def __init__(self, n):
         super().__init__(f"Scalings({n})", num_params=n, element_shape=(n,))
@@ -88,8 +88,8 @@ class Scalings(Group):
 
 
 @pytest.mark.parametrize("n_blocks", [2, 8])
-def test_elements_that_are_no_matrices_are_vectors(n_blocks):
-    """Also where there are as many blocks as numbers in each."""
+def test_elements_that_are_not_matrices_are_vectors(n_blocks):
+    """Also with as many blocks as numbers in each block."""
     group = Scalings(2)
     found = th.rand(5, n_blocks, 2, generator=th.Generator().manual_seed(0))
     assert coordinate_names(group) == ["x 0", "x 1"] and th.equal(coordinates(group, found), found - 1)
@@ -104,9 +104,9 @@ def test_elements_that_are_no_matrices_are_vectors(n_blocks):
     np.testing.assert_allclose(offsets, states[:, :2].numpy())
 
 
-def test_other_agents_are_refused():
+def test_other_agents_raise():
     model = DQN("MlpPolicy", "CartPole-v1", device="cpu")
-    windows = play(EqRQRDQN("MlpPolicy", "CartPole-v1", device="cpu"), "CartPole-v1", 40, depth=2)  # an id is enough
+    windows = play(EqRQRDQN("MlpPolicy", "CartPole-v1", device="cpu"), "CartPole-v1", 40, depth=2)  # an id suffices
     message = r"needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which has no latent model"
     for look in (
         lambda: play(model, "CartPole-v1"),

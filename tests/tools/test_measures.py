@@ -1,4 +1,4 @@
-"""The numbers of a diagnosis against hand computation."""
+"""The metrics of a diagnosis, compared with numbers computed by hand."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from sb3_eqr.visualize import measures
 from sb3_eqr.visualize.diagnostics import find_verdict, skill_and_gain
 
 
-def test_transition_error_is_what_loops_over_windows_and_pairs_give():
+def test_transition_error_matches_loops_over_windows_and_pairs():
     rng = np.random.default_rng(0)
     n, m, d = 6, 3, 4
     x0, x, guess = rng.normal(size=(n, d)), rng.normal(size=(n, m, d)), rng.normal(size=(n, m, d))
@@ -49,7 +49,7 @@ def test_reward_error():
     assert same.error == 1 and same.constant == 0 and np.isnan(same.explained)
 
 
-def test_moments_of_angles_across_the_seam():
+def test_moments_of_angles_across_pi():
     mean, std = measures.angle_moments(th.tensor([np.pi - 0.1, -np.pi + 0.1]))
     assert abs(mean) == pytest.approx(np.pi) and std == pytest.approx(np.sqrt(-2 * np.log(np.cos(0.1))), rel=1e-4)
     mean, std = measures.angle_moments(0.5 + 0.01 * th.randn(5000, generator=th.Generator().manual_seed(0)))
@@ -65,7 +65,7 @@ def test_concentration():
 def test_opposites_are_mutual():
     generators = np.array([[1.0, 0.0], [-2.0, 0.1], [0.0, 1.0], [0.1, -1.0], [0.0, 0.0]])
     assert measures.opposites(generators) == [1, 0, 3, 2, 4]
-    assert measures.opposites(np.array([[1.0, 0.0], [0.9, 0.1], [-1.0, 0.0]])) == [2, 1, 0]  # the second has none
+    assert measures.opposites(np.array([[1.0, 0.0], [0.9, 0.1], [-1.0, 0.0]])) == [2, 1, 0]  # the second has no opposite
     merged = measures.merged(np.arange(10.0).reshape(5, 2), [1, 0, 3, 2, 4])
     assert merged.tolist() == [[1, 2], [5, 6], [8, 9]]
 
@@ -85,7 +85,7 @@ def test_mutual_information_of_a_known_joint():
     first, second = np.repeat([0, 0, 1, 1], counts.ravel()), np.repeat([0, 1, 0, 1], counts.ravel())
     p = counts / 1000
     plain = (p * np.log(p / p.sum(axis=1, keepdims=True) / p.sum(axis=0))).sum()
-    miller = (1 + 1 - 3) / 2000  # occupied labels less one: of each, of both together
+    miller = (1 + 1 - 3) / 2000  # occupied labels minus one: of each variable, minus that of both
     assert measures.mutual_information(first, second) == pytest.approx(plain + miller)
     assert measures.entropy(np.arange(1600) % 16) == pytest.approx(np.log(16) + 15 / 3200)
     a, b = np.random.default_rng(0).integers(0, 10, (2, 1000))
@@ -93,14 +93,14 @@ def test_mutual_information_of_a_known_joint():
     assert measures.mutual_information(a, np.zeros(1000, dtype=int)) == 0
 
 
-def test_bins_and_cells_find_the_places_of_a_ring():
+def test_bins_and_cells_find_the_positions_of_a_ring():
     places = np.random.default_rng(0).integers(0, 16, 800)
     angles = 2 * np.pi * places / 16
     points = th.as_tensor(np.stack([np.cos(angles), np.sin(angles)], axis=1))
     labels = measures.cells(points, n_cells=16)
     assert measures.mutual_information(labels, places) == pytest.approx(measures.entropy(places))
     assert np.bincount(measures.bins(np.sin(np.arange(800)), 8)).tolist() == [100] * 8
-    assert len(np.unique(measures.bins(places, 40))) == 16  # no more than there are
+    assert len(np.unique(measures.bins(places, 40))) == 16  # no more bins than distinct values
     assert not measures.cells(th.ones(9, 2)).any()
 
 
@@ -130,9 +130,9 @@ def errors(error, shuffled, still):
     "error, shuffled, still, verdict",
     [
         ([0.01, 0.02], [0.1, 0.1], [0.05, 0.1], "predicts"),
-        ([1e-8, 1e-8], [1e-6, 1e-6], [1e-6, 1e-6], "predicts"),  # states differ little, and it knows how
-        ([0.01, 0.02], [0.1, 0.1], [0.001, 0.002], "does not predict"),  # κ moves states less than they differ
-        ([0.2, 0.2], [0.2, 0.2], [1e-7, 1e-7], "does not predict"),  # one state, which κ leaves
+        ([1e-8, 1e-8], [1e-6, 1e-6], [1e-6, 1e-6], "predicts"),  # states differ little, but it predicts how
+        ([0.01, 0.02], [0.1, 0.1], [0.001, 0.002], "does not predict"),  # κ changes states less than they differ
+        ([0.2, 0.2], [0.2, 0.2], [1e-7, 1e-7], "does not predict"),  # a single state, which κ does not change
         ([1e-7, 1e-7], [1e-6, 1e-6], [1e-8, 1e-8], "collapsed"),
     ],
 )
@@ -140,7 +140,7 @@ def test_verdict(error, shuffled, still, verdict):
     assert find_verdict(errors(error, shuffled, still)) == verdict
 
 
-def test_skill_and_gain_weigh_steps_by_their_windows():
+def test_skill_and_gain_weight_steps_by_their_windows():
     skill, gain = skill_and_gain(errors([1.0, 4.0], [4.0, 4.0], [2.0, 8.0]))
     assert skill == pytest.approx(1 - (100 * 1 + 50 * 4) / (100 * 4 + 50 * 4))
     assert gain == pytest.approx(1 - (100 * 1 + 50 * 4) / (100 * 2 + 50 * 8))

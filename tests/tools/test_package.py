@@ -1,4 +1,4 @@
-"""What a user gets beside the code: hyperparameter files, examples, the README, the linter's picture of the house."""
+"""What users get besides the code: hyperparameter files, extras, docstrings, the README."""
 
 import inspect
 import os
@@ -38,12 +38,12 @@ EXTRAS = ("ale_py", "cv2", "matplotlib", "rl_zoo3", "ray", "rliable")
 
 
 @pytest.mark.slow
-def test_importing_needs_no_extra():
+def test_importing_works_without_extras():
     code = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS})); import sb3_eqr, sb3_eqr.envs, sb3_eqr.representation"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
-def test_a_missing_extra_is_named(monkeypatch):
+def test_missing_extras_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ale_py", None)
     with pytest.raises(ImportError, match=re.escape('pip install ".[atari]" in a clone of the repository')):
         make_atari100k_env("Pong")
@@ -56,8 +56,8 @@ def test_public_names_and_docstrings():
 
 
 @pytest.mark.parametrize("algorithm", [EqRQRDQN, EqRRainbow])
-def test_every_argument_is_explained(algorithm):
-    """In help(): the arguments of the agent and of its policy, each once."""
+def test_every_argument_is_documented(algorithm):
+    """help() has the arguments of the agent and of its policy, each once."""
     policy = algorithm.policy_aliases["MlpPolicy"]
     for callables in ([algorithm.__init__], [policy.__init__, EqRPolicy.__init__]):
         text = "".join((function.__doc__ or "") for function in callables) + "".join(c.__doc__ for c in (policy, EqRPolicy))
@@ -77,7 +77,7 @@ def test_readme_example_runs(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("chosen", [None, "ACTIVE"])
 def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen):
-    """OpenMP reads the variable once, when PyTorch loads it; what the user has chosen stays."""
+    """OpenMP reads the variable once, when PyTorch loads it. The user's choice is kept."""
     code = (
         "import sys, os, atexit, sb3_eqr_command as command; print('torch' in sys.modules); sys.argv = ['sb3-eqr', '--help']; "
     )

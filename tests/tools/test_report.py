@@ -1,4 +1,4 @@
-"""From result.json files to the numbers, words and files of a report."""
+"""From result.json files to the numbers, sentences and files of a report."""
 
 import base64
 import json
@@ -68,7 +68,7 @@ def a_result(agent, game, seed, score):
         "resumed_at": [],
         "evaluations": [
             {"step": 50_000, "kind": "curve", "scores": [score / 2, score / 2], "lengths": [7, 7]},
-            {"step": 100_000, "kind": "curve", "scores": [999.0], "lengths": [7]},  # the final one counts instead
+            {"step": 100_000, "kind": "curve", "scores": [999.0], "lengths": [7]},  # the final evaluation is used instead
             {"step": 100_000, "kind": "final", "scores": [score - 1, score + 1], "lengths": [8, 8]},
         ],
         "training": {"step": [10], "score": [3.0], "length": [10]},
@@ -91,7 +91,7 @@ def a_benchmark(folder, scores=SCORES, suite=SUITE, change=lambda result: result
 
 
 def matrix(agent, scores=SCORES):
-    """(runs, games), human-normalised, without any of our code."""
+    """(runs, games), human-normalised, computed without the package."""
     bounds = {"Pong": PONG, "Boxing": BOXING, "Krull": KRULL}
     rows = [[(v - bounds[g][0]) / (bounds[g][1] - bounds[g][0]) for v in values] for g, values in scores[agent].items()]
     return np.array(rows).T
@@ -99,7 +99,7 @@ def matrix(agent, scores=SCORES):
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """Every agent, game and seed, without figures, which take most of the time; :func:`drawn` has them."""
+    """Every agent, game and seed. The figures, which take most of the time, are in :func:`drawn`."""
     folder = tmp_path_factory.mktemp("report")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report_module, "all_figures", lambda analysis: [])
@@ -108,7 +108,7 @@ def report(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
-    """Every figure, of two agents, one game and two seeds; without the constrained layout, which takes half of the time."""
+    """Every figure, for two agents, one game and two seeds, without the constrained layout, which takes half the time."""
     folder = tmp_path_factory.mktemp("drawn")
     scores = {agent: {"Pong": SCORES[agent]["Pong"][:2]} for agent in (BASE, FULL)}
 
@@ -132,8 +132,8 @@ def text_of(page):
     return re.sub(r"\s+", " ", page.read_text(encoding="utf-8"))
 
 
-def test_the_numbers_are_those_of_rliable(report):
-    """From result.json to aggregates.csv, against rliable called here on scores normalised here."""
+def test_the_numbers_match_rliable(report):
+    """aggregates.csv equals the results of rliable on scores normalised in this file."""
     found = pd.read_csv(report.with_name("aggregates.csv"), keep_default_na=False, na_values=[""])
     for agent in SCORES:
         rows = found[found["agent"] == agent].set_index("metric")
@@ -146,14 +146,14 @@ def test_the_numbers_are_those_of_rliable(report):
         for name, function in functions.items():
             assert rows.at[name, "value"] == pytest.approx(function(matrix(agent)))
         np.random.seed(0)
-        ordered = matrix(agent)[:, [1, 2, 0]]  # the bootstrap draws for the games in alphabetical order
+        ordered = matrix(agent)[:, [1, 2, 0]]  # the bootstrap samples the games in alphabetical order
         _, ends = library.get_interval_estimates({"": ordered}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=50)
         assert rows.loc["IQM", ["low", "high"]].tolist() == pytest.approx(ends[""][:, 0].tolist())
         assert rows.at["superhuman games", "value"] == (matrix(agent).mean(axis=0) > 1).sum()
         assert (rows["runs"] == 3).all() and (rows["games"] == 3).all() and (rows["from"] == "runs").all()
 
 
-def test_published_methods_join_as_means_of_the_games_present(report):
+def test_published_methods_are_means_over_the_games_present(report):
     found = pd.read_csv(report.with_name("aggregates.csv")).query("agent == 'EqR, R + GET (paper)'").set_index("metric")
     values = [(-6.1 + 20.7) / 35.3, (39.2 - 0.1) / 12.0, (5467.7 - 1598) / 1067.5]  # Table 2
     assert found.at["mean", "value"] == pytest.approx(np.mean(values))
@@ -186,12 +186,12 @@ def test_the_table_of_games(report):
     assert "eqr_rainbow" not in "".join(line for line in tex.splitlines(keepends=True) if not line.startswith("%"))
 
 
-def test_bold_is_the_best_that_the_runs_distinguish(tmp_path, not_drawn):
-    """Of four runs with means 10 and 20 and a spread of 1; where they differ by less than their spread, nothing is bold."""
+def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
+    """Four runs with means 10 and 20 and a spread of 1; if the means differ by less than the spread, nothing is bold."""
     apart, alike = [9.0, 10.0, 11.0, 10.0], [9.1, 10.1, 11.1, 10.1]
     scores = {"dqn": {"Pong": apart, "Boxing": apart}, FULL: {"Pong": [2 * score for score in apart], "Boxing": alike}}
     page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=100)
-    assert re.findall("<b>(.*?)</b>", page.read_text())[1:] == ["20.0", "1.000"]  # the first one is the summary's IQM
+    assert re.findall("<b>(.*?)</b>", page.read_text())[1:] == ["20.0", "1.000"]  # the first is the IQM of the summary
     assert r"\bfseries 20.0 $\pm$ 1.6" in page.with_name("table.tex").read_text()
     assert "**20.0** ± 1.6" in page.with_name("table.md").read_text()
     assert f"{FULL} is better than dqn: its IQM is" in text_of(page).partition("Aggregates</h2>")[0]
@@ -199,7 +199,7 @@ def test_bold_is_the_best_that_the_runs_distinguish(tmp_path, not_drawn):
 
 def test_the_files_of_a_report(drawn, report):
     names = {"profiles", "aggregates", "improvement", "sample_efficiency", "learning_curves", "symmetry_losses"}
-    names |= {"loss_components_eqr_rainbow"}  # two of them; of the groups there is but one
+    names |= {"loss_components_eqr_rainbow"}  # drawn for two loss combinations, but not for a single group
     data = {"report.html", "table.md", "table.tex", "scores.csv", "scores.parquet", "aggregates.csv"}
     assert {path.name for path in drawn.parent.iterdir()} == data | {f"{name}.png" for name in names}
     for path in drawn.parent.glob("*.png"):
@@ -209,7 +209,7 @@ def test_the_files_of_a_report(drawn, report):
     pd.testing.assert_frame_equal(scores, pd.read_parquet(report.with_name("scores.parquet")))
 
 
-def test_the_page_needs_nothing_from_elsewhere(drawn):
+def test_the_page_is_self_contained(drawn):
     page = drawn.read_text(encoding="utf-8")
     assert page.startswith("<!DOCTYPE html>") and page.endswith("</html>\n")
     assert not re.search(r"<script|<link|@import|url\(|https?:", page)
@@ -219,7 +219,7 @@ def test_the_page_needs_nothing_from_elsewhere(drawn):
     assert set(re.findall(r'href="#(\w+)"', page)) | {"conclusion"} == set(re.findall(r'id="(\w+)"', page))
 
 
-def test_the_page_says_how_to_repeat_it(report):
+def test_the_page_has_the_commands_that_made_it(report):
     page = text_of(report)
     assert page.count("sb3-eqr benchmark run small --agents dqn") == 1
     assert "Linux" in page and "55.5" in page and "<td>30.0</td>" in page and "batch_size" in page
@@ -252,7 +252,7 @@ def with_steps(agent, steps):
     return change
 
 
-def test_another_protocol_is_refused_or_marked(tmp_path, not_drawn):
+def test_a_different_protocol_raises_or_is_marked(tmp_path, not_drawn):
     folder = a_benchmark(tmp_path / "a", change=with_steps(BASE, 50_000))
     text = f"got {BASE}: steps is 50000, not 100000 (Pong, Boxing, Krull). Select agents with --agents, or pass --force"
     with pytest.raises(ValueError, match=re.escape(text)):
@@ -268,7 +268,7 @@ def test_another_protocol_is_refused_or_marked(tmp_path, not_drawn):
     assert set(rows["agent"]) == {BASE} and rows["protocol_differs"].str.startswith("steps is 50000").all()
 
 
-def test_what_is_missing_is_left_out_and_told(tmp_path, not_drawn):
+def test_missing_runs_are_omitted_and_reported(tmp_path, not_drawn):
     def change(result):
         run = (result["agent"], result["game"], result["seed"])
         return None if run[:2] == ("dqn", "Krull") or run == (FULL, "Pong", 1) else result
@@ -324,7 +324,7 @@ def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
         compare([folders[0], later], {}, False)
 
 
-def test_agents_and_baseline_are_chosen(tmp_path):
+def test_selecting_agents_and_baseline(tmp_path):
     folder = a_benchmark(tmp_path / "a")
     assert compare([folder], {}, False, baseline=FULL).agents == [FULL, "dqn", BASE]
     assert compare([folder], {}, False, [BASE], FULL).agents == [FULL, BASE]
@@ -334,7 +334,7 @@ def test_agents_and_baseline_are_chosen(tmp_path):
         compare([folder], {}, False, baseline="ppo")
 
 
-def test_published_scores_stand_beside_runs_of_their_steps_only(tmp_path, not_drawn):
+def test_published_scores_are_only_shown_with_runs_of_the_same_steps(tmp_path, not_drawn):
     def change(result):
         result["protocol"]["steps"] = 10_000
         return result
@@ -344,7 +344,7 @@ def test_published_scores_stand_beside_runs_of_their_steps_only(tmp_path, not_dr
     assert "†" not in text and "superhuman games" in text
 
 
-def test_runs_of_other_hyperparameters_are_told(tmp_path):
+def test_runs_with_different_hyperparameters_are_reported(tmp_path):
     def change(result):
         if (result["agent"], result["seed"]) == (BASE, 2):
             result["entry"]["hyperparameters"]["batch_size"] = 64
@@ -355,7 +355,7 @@ def test_runs_of_other_hyperparameters_are_told(tmp_path):
     ]
 
 
-def test_agents_that_learn_nothing_are_told(tmp_path):
+def test_agents_that_learn_nothing_are_reported(tmp_path):
     def change(result):
         result["entry"]["hyperparameters"]["learning_starts"] = 100_000 if result["agent"] == "dqn" else 99_999
         return result
@@ -367,13 +367,13 @@ def test_agents_that_learn_nothing_are_told(tmp_path):
     ]
 
 
-def test_what_is_alike_is_not_bold(tmp_path, not_drawn):
+def test_equal_scores_are_not_bold(tmp_path, not_drawn):
     scores = {"dqn": {"Pong": [1.0, 2.0]}, "qrdqn": {"Pong": [2.0, 1.0]}}
     page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=5)
     assert "<b>" not in text_of(page) and "qrdqn and dqn have the same IQM." in text_of(page)
 
 
-def test_two_folders_are_one_benchmark(tmp_path):
+def test_two_folders_make_one_benchmark(tmp_path):
     first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]})
     second = a_benchmark(tmp_path / "b", {FULL: SCORES[FULL]})
     found = compare([second, first], {}, False)
@@ -404,13 +404,13 @@ def test_without_pyarrow_the_parquet_file_is_skipped(tmp_path, not_drawn, monkey
     assert not page.with_name("scores.parquet").exists() and page.with_name("scores.csv").exists()
 
 
-def test_other_units_stand_without_published_scores(tmp_path, not_drawn):
+def test_other_units_have_no_published_scores(tmp_path, not_drawn):
     suite = normalised("random play 0, solved 1")
     text = text_of(write_report([a_benchmark(tmp_path / "a", suite=suite)], {}, False, tmp_path / "report", reps=5))
     assert "games above 1" in text and "superhuman" not in text and "SPR" not in text and "†" not in text
 
 
-def test_a_reference_of_runs_joins_with_intervals(tmp_path, not_drawn):
+def test_a_reference_with_runs_has_intervals(tmp_path, not_drawn):
     file = tmp_path / "theirs.json"
     file.write_text(json.dumps({"pong": [0.0, 1.0], "BOXING": [5.0, 6.0], "kr_ull": [2000, 2100], "Hero": [1.0]}))
     page = write_report([a_benchmark(tmp_path / "a")], {"THEIRS": file}, False, tmp_path / "report", reps=20)
@@ -424,7 +424,7 @@ def test_a_reference_of_runs_joins_with_intervals(tmp_path, not_drawn):
         compare([tmp_path / "a"], {"dqn": file}, False)
 
 
-def test_curves_are_shares_of_the_steps_and_end_with_the_final_evaluation(tmp_path):
+def test_curves_are_over_fractions_of_the_steps_and_end_with_the_final_evaluation(tmp_path):
     def change(result):
         if result["game"] == "Krull":  # twice as long as the others
             result["protocol"]["steps"] = 200_000
@@ -441,7 +441,7 @@ def test_curves_are_shares_of_the_steps_and_end_with_the_final_evaluation(tmp_pa
     assert losses["step"].tolist() == [5, 10] * 3 and (losses["value"] == 0.75).all()  # thousands: ends of twentieths
 
 
-def test_figures_without_anything_to_show_are_left_out(tmp_path):
+def test_empty_figures_are_omitted(tmp_path):
     def change(result):
         return result | {"losses": [], "evaluations": result["evaluations"][-1:]}
 
@@ -449,13 +449,13 @@ def test_figures_without_anything_to_show_are_left_out(tmp_path):
     assert [shown.name for shown in found] == ["profiles", "aggregates"]
 
 
-def test_the_ablations_of_groups_have_their_figure(tmp_path):
+def test_ablations_of_groups_have_a_figure(tmp_path):
     scores = {"eqr_qrdqn:mlp+aet+r": SCORES["dqn"], "eqr_qrdqn:gl2+aet+r": SCORES[FULL], FULL: SCORES[FULL]}
     found = {p.name for p in all_figures(analyse(compare([a_benchmark(tmp_path / "a", scores)], {}, False), 5))}
     assert "groups_eqr_qrdqn" in found and not {"groups_eqr_rainbow", "loss_components_eqr_rainbow"} & found
 
 
-def test_agents_differ_without_colours():
+def test_agents_can_be_told_apart_without_colours():
     style = looks([str(i) for i in range(66)])
     assert len({(look.line, look.marker) for look in style.values()}) == 66
 
@@ -477,6 +477,6 @@ def test_numbers(value, decimals, text):
     assert number(value, decimals) == text
 
 
-def test_published_means_have_the_names_of_the_suite():
+def test_published_means_use_the_names_of_the_suite():
     means = published_means(SHOWN, ["Bank_Heist", "Tetris", "Pong"])
     assert means.index.tolist() == ["Bank_Heist", "Pong"] and means.at["Pong", "EqR, R (paper)"] == -6.0

@@ -1,4 +1,4 @@
-"""The speed script: what it counts is right, ratios are within rounds, and it runs from start to end."""
+"""The speed script: its counts are correct, ratios are computed within rounds, and it runs completely."""
 
 import argparse
 import json
@@ -38,7 +38,7 @@ def test_bytes_per_transition():
     assert ours <= 8_500 < 56_000 < stock
 
 
-def test_floor_leaves_the_agent_alone():
+def test_floor_does_not_change_the_agent():
     model = make_agent("EqRQRDQN", buffer_size=64, prediction_depth=1, batch_size=2)
     before = [parameter.clone() for parameter in model.policy.parameters()]
     Floor(model).steps(2)
@@ -63,16 +63,16 @@ class Cube(th.autograd.Function):
 def test_operations_by_hand():
     x, weight, gradient = th.ones(2, 3, requires_grad=True), th.ones(4, 3), th.ones(2, 3)
     assert count_operations(lambda: (x * x).sum()) == 2
-    assert count_operations(lambda: th.nn.functional.linear(x, weight)) == 1  # what is called inside does not count
+    assert count_operations(lambda: th.nn.functional.linear(x, weight)) == 1  # nested operations are not counted
     assert count_operations(lambda: th.autograd.grad(x * gradient, x, gradient)) == 2
     assert count_operations(lambda: th.autograd.grad(Cube.apply(x), x, gradient)) == 5
 
 
-def test_taking_turns():
+def test_calls_are_timed_alternately():
     order = []
     calls = {name: lambda name=name: order.append(name) for name in "ab"}
     timings = take_turns(calls, rounds=3, n_per_call=2)
-    assert order == list("ab" * 4)  # the first round does not count
+    assert order == list("ab" * 4)  # the first round is a warm-up
     assert [len(numbers) for name in "ab" for numbers in timings[name]] == [3] * 6
 
 
@@ -80,7 +80,7 @@ def test_ratios_and_growth(monkeypatch):
     ms, more = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
     fast, slow = Series(ms, ms, ms), Series(more, 3 * more, ms)
     monkeypatch.setattr(th, "get_num_threads", lambda: 1)
-    assert slow.ratio(fast) == 6.0  # processor time
+    assert slow.ratio(fast) == 6.0  # of CPU time
     monkeypatch.setattr(th, "get_num_threads", lambda: 2)
     assert slow.ratio(fast) == 2.0
     assert growth([2.0, 4.0, 12.0], [1.0, 2.0, 3.0]) == [1.0, 1.0, 2.0] and growth([2.0, 1.0], [1.0, 1.0]) == [1.0, 0.5]
@@ -115,8 +115,8 @@ def test_wrong_options(wrong, message, capsys):
     assert message in " ".join(capsys.readouterr().err.split())
 
 
-def test_another_version_beside_this_one(monkeypatch):
-    """Here it is the same version: its classes are others, and do the same."""
+def test_importing_another_version_together_with_this_one(monkeypatch):
+    """The same version, imported again: its classes are different objects and behave the same."""
     monkeypatch.setattr(workload, "AGENTS", dict(AGENTS))
     modules, path = dict(sys.modules), list(sys.path)
     workload.add_before(str(ROOT))
@@ -150,7 +150,7 @@ def test_script_prints_its_tables(tmp_path):
 
 @pytest.mark.slow
 def test_evaluation_and_sizes(monkeypatch):
-    """A few short games and small buffers."""
+    """With a few short games and small buffers."""
     for name, value in {"N_GAMES": 2, "ONE_BY_ONE": 1, "MAX_STEPS": 20}.items():
         monkeypatch.setattr(speed, name, value)
     args = argparse.Namespace(rounds=1, largest=10_000, threads=1)

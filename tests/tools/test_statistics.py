@@ -1,4 +1,4 @@
-"""Aggregates of known scores, by hand and by rliable itself."""
+"""Aggregates of known scores, compared with numbers computed by hand and with rliable."""
 
 import time
 
@@ -36,11 +36,11 @@ def test_aggregates_by_hand():
     values = aggregate(score_matrices(scores), reps=10).set_index("metric")["value"]
     assert values["IQM"] == pytest.approx(0.5)
     assert values["mean"] == pytest.approx(10.1 / 8)
-    assert values["median"] == pytest.approx((0.3 + 0.7) / 2)  # of the means of the games
+    assert values["median"] == pytest.approx((0.3 + 0.7) / 2)  # of the games' means
     assert values["optimality gap"] == pytest.approx(1 - (0.0 + 0.2 + 0.6 + 1 + 0.1 + 0.4 + 0.8 + 1) / 8)
 
 
-def test_intervals_are_those_of_rliable():
+def test_intervals_match_rliable():
     matrix = np.random.default_rng(0).gamma(1.0, 1.0, (5, 6))
     found = aggregate({"a": matrix}, reps=200, seed=3)
     np.random.seed(3)
@@ -57,24 +57,24 @@ def test_a_single_run_has_no_interval():
     assert found["value"].tolist() == [1, 1, 1, 0] and found[["low", "high"]].isna().all(axis=None)
 
 
-def test_unequal_runs_are_told():
+def test_unequal_numbers_of_runs_raise():
     with pytest.raises(ValueError, match="a must have the same number of runs on every game, got game0: 1, game1: 2"):
         score_matrices(table("a", [[1.0, 2.0], [1.0, 2.0]]).query("game != 'game0' or seed == 0"))
 
 
-def test_the_detectable_difference_is_what_resampling_whole_experiments_gives():
-    """One game without tails to trim: the IQM of n runs varies as 25 %-trimmed means of n draws do."""
+def test_the_detectable_difference_matches_resampled_experiments():
+    """For one game, the IQM of n runs varies like the 25 %-trimmed mean of n samples."""
     rng = np.random.default_rng(1)
     first, second = rng.normal(0, 1.0, (400, 1)), rng.normal(0, 2.0, (400, 1))
     drawn = rng.normal(0, 1.0, (1_000, 400))
-    spread = np.sort(drawn, axis=1)[:, 100:300].mean(axis=1).std()  # of an IQM of 400 runs, sd 1
+    spread = np.sort(drawn, axis=1)[:, 100:300].mean(axis=1).std()  # of the IQM of 400 runs with standard deviation 1
     assert detectable_difference(first, second, 500) == pytest.approx(1.96 * spread * np.sqrt(1 + 4), rel=0.15)
     assert np.isnan(detectable_difference(first[:1], second))
 
 
 @pytest.mark.parametrize("n_runs", [2, 3])
-def test_the_detectable_difference_of_few_runs_is_that_of_a_t_test(n_runs):
-    """Of three runs on one game the IQM leaves none out: it is their mean."""
+def test_the_detectable_difference_of_few_runs_matches_a_t_test(n_runs):
+    """The IQM of three runs on one game is their mean, because it trims none."""
     first, second = np.random.default_rng(0).normal(0, [[1.0], [2.0]], (2, n_runs))
     standard_error = np.sqrt((first.var(ddof=1) + second.var(ddof=1)) / n_runs)
     critical = {2: 4.303, 3: 2.776}[n_runs]  # Student's t, 2 (n - 1) degrees of freedom, 97.5 %
@@ -82,10 +82,10 @@ def test_the_detectable_difference_of_few_runs_is_that_of_a_t_test(n_runs):
     assert found == pytest.approx(critical * standard_error, rel=0.1)  # three standard deviations of the bootstrap
 
 
-def test_agents_that_are_alike_are_seldom_told_apart():
+def test_equal_agents_are_rarely_distinguished():
     """
-    At most one time in twenty, within three standard deviations of 100 trials: 11 of them. With the bootstrap's own variance
-    and a normal quantile it would be a fifth of them.
+    At most in 11 of 100 trials: 5 % plus three standard deviations. With the bootstrap's variance and a normal quantile it
+    would be 20 %.
     """
     rng = np.random.default_rng(0)
     means = rng.normal(size=3)
@@ -97,7 +97,7 @@ def test_agents_that_are_alike_are_seldom_told_apart():
 
 
 def test_profiles_by_hand():
-    """Two runs, two games: 3 of 4 scores lie above 0.5, and the mean of one game of two."""
+    """Two runs, two games: 3 of 4 scores are above 0.5, and so is the mean of one of two games."""
     matrix = np.array([[0.0, 0.6], [0.8, 1.0]])
     taus = np.array([-1.0, 0.5, 2.0])
     value, low, high = performance_profile(matrix, taus, reps=20)
@@ -107,7 +107,7 @@ def test_profiles_by_hand():
     assert np.isnan(low).all() and np.isnan(high).all()
 
 
-def test_profiles_are_those_of_rliable():
+def test_profiles_match_rliable():
     matrix, taus = np.random.default_rng(0).gamma(1.0, 1.0, (4, 3)), np.linspace(0, 2, 5)
     np.random.seed(5)
     values, bands = library.create_performance_profile({"a": matrix}, taus, reps=30)
@@ -115,7 +115,7 @@ def test_profiles_are_those_of_rliable():
     np.testing.assert_allclose(found, [values["a"], *bands["a"]])
 
 
-def test_probability_of_improvement_is_that_of_rliable():
+def test_probability_of_improvement_matches_rliable():
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, 4, (5, 6)) / 1.0, rng.integers(0, 4, (3, 6)) / 1.0  # with ties
     assert probability_of_improvement(first, second) == pytest.approx(metrics.probability_of_improvement(first, second))
@@ -132,7 +132,7 @@ def test_probability_of_improvement_is_that_of_rliable():
 
 
 def test_a_report_of_six_agents_takes_seconds():
-    """Ten runs on five games with five points: what the report asks for. rliable's own loop takes minutes."""
+    """The report's statistics for ten runs on five games with five points. rliable's loop takes minutes."""
     rng = np.random.default_rng(0)
     agents = {str(i): rng.gamma(1.0, 1.0, (10, 5)) for i in range(6)}
     began, taus = time.process_time(), np.linspace(0, 3, 81)
@@ -154,7 +154,7 @@ def test_sample_efficiency_is_an_iqm_per_point():
     assert (low < value).all() and (value < high).all()
 
 
-def test_games_above_are_counted_by_their_means():
+def test_games_above_a_threshold_are_counted_by_their_means():
     assert games_above(np.array([[0.0, 1.0, 3.0], [3.0, 1.0, 0.0]])) == 2
 
 

@@ -1,4 +1,4 @@
-"""A diagnosis tells what an agent's latent model knows; the command line writes it down."""
+"""The diagnosis of an agent's latent model, and the command line that writes it to files."""
 
 import functools
 import pickle
@@ -34,8 +34,8 @@ PICTURES = ("transition", "motion", "generators", "disentanglement", "collapse",
 
 class Ring(gym.Env):
     """
-    A point on a circle, turned by ±0.4 radians. Seen as (cos, sin, 1); or with ``unwound`` as (angle, 0), the angle growing
-    beyond π; or with ``keys`` as a dictionary.
+    A point on a circle that moves by ±0.4 radians. The observation is (cos, sin, 1), or with ``unwound`` (angle, 0), where the
+    angle may exceed π; with ``keys`` it is in a dictionary.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -83,12 +83,12 @@ def look(model, n_steps=300, **kwargs):
 
 @pytest.fixture(scope="module")
 def trained():
-    """The losses of the latent model alone, a large learning rate and a fast target: it predicts after 80 updates."""
+    """With the latent model's losses only, a large learning rate and a fast target, the model predicts after 80 updates."""
     return make_model(td_coef=0, aet_coef=3.0, reward_coef=3.0, learning_rate=1e-2, learning_starts=40, tau=0.2).learn(120)
 
 
 def collapse(model):
-    """Every state is one, and κ is the identity."""
+    """Make all states equal and κ the identity."""
     with th.no_grad():
         model.policy.group_layer.to_algebra.weight.zero_()
         for parameter in model.policy.latent_model.transition[-1].parameters():
@@ -104,7 +104,7 @@ def test_three_agents_three_verdicts(trained):
 
 
 def by_hand():
-    """x = R(angle), κ(x, a) = R(±0.4), ρ = 1, r = 0: exact where the angle is seen unwound."""
+    """x = R(angle), κ(x, a) = R(±0.4), ρ = 1, r = 0, which is exact for unwound angles."""
     model = make_model(env=Ring(unwound=True), n_blocks=1, network=PAPER_FLAT)
     latent = model.policy.latent_model
     with th.no_grad():
@@ -119,7 +119,7 @@ def by_hand():
     return model
 
 
-def test_an_exact_model_is_seen_as_exact():
+def test_an_exact_model_has_exact_metrics():
     found = look(by_hand(), n_steps=600, unwound=True)
     chord = 2 * np.sqrt(2) * np.sin(STEP / 2)  # ‖R(0.4) x − x‖, four entries
     assert found.verdict == "predicts" and found.blocks == ["SO(2) 0"]
@@ -131,7 +131,7 @@ def test_an_exact_model_is_seen_as_exact():
     assert (generators.std < 2e-3).all()
     assert found.disentanglement.opposites == [1, 0] and np.isnan(found.disentanglement.specificity).all()
     assert found.disentanglement.information[0, 0] > 0.8 and found.disentanglement.redundancy.tolist() == [[1]]
-    symmetry = found.action_symmetry  # rotations of the plane commute: ρ = 1 is right
+    symmetry = found.action_symmetry  # rotations of the plane commute, so ρ = 1 is correct
     assert symmetry.distance == symmetry.identity < 1e-9 and symmetry.from_identity == 0 and symmetry.shuffled > 0.1
     assert found.collapse.size == pytest.approx(np.sqrt(2)) and found.collapse.dimensions == 4
     assert found.collapse.effective_rank == pytest.approx(2, abs=0.1)  # a circle
@@ -139,7 +139,7 @@ def test_an_exact_model_is_seen_as_exact():
     assert np.allclose(found.rewards.explained, 0, atol=1e-6)
 
 
-def test_rewards_that_never_vary_and_signs():
+def test_constant_rewards_and_signs():
     model = make_model(network={"reward_loss": "categorical"})
     window = play(model, make_vec_env(Ring), 100, depth=2)
     found = diagnose(model, window).rewards
@@ -154,7 +154,7 @@ def generators():
     return random.getstate(), pickle.dumps(np.random.get_state()), th.get_rng_state().tolist()
 
 
-def test_same_seed_same_numbers_and_global_generators_as_they_were(trained):
+def test_the_same_seed_gives_the_same_numbers_without_side_effects(trained):
     windows = play(trained, make_vec_env(Ring), 60, depth=3)
     state = generators()
     mode = [module.training for module in trained.policy.modules()]
@@ -186,7 +186,7 @@ def test_every_group(group):
     assert found.disentanglement.information.shape == (n_blocks, 1) and (found.action_symmetry is not None) == inverse
     assert set(all_tables(found, ["0", "1"])) == set(FILES)
     figure = latent_figure(model, encode(model, windows.samples.observations), windows.factors[:, 0], "angle")
-    assert len(figure.axes) == n_blocks + 1  # and the colour bar
+    assert len(figure.axes) == n_blocks + 1  # including the colour bar
     if group in DRAWN:
         assert {*all_pictures(found, ["0", "1"]), "latents"} == set(PICTURES)
 
@@ -198,7 +198,7 @@ def test_dict_observations_and_an_agent_without_latent_losses():
 
 
 @pytest.mark.parametrize("off", ["reward", "symmetry"])
-def test_what_was_never_trained_is_told_and_not_drawn(off):
+def test_untrained_networks_are_reported_and_not_drawn(off):
     found = look(make_model(**{f"{off}_coef": 0}), n_steps=60)
     tables, figures = all_tables(found, ["0", "1"]), all_pictures(found, ["0", "1"])
     assert tables["rewards"]["trained"].tolist() == [off != "reward"] * 3
@@ -206,12 +206,12 @@ def test_what_was_never_trained_is_told_and_not_drawn(off):
     assert ("rewards" not in figures) == (off == "reward")
 
 
-def test_pictures_have_one_scale_and_room_for_what_they_show():
+def test_plots_share_a_scale_and_have_margins():
     found = look(make_model(n_blocks=7), n_steps=60)
     figures = all_pictures(found, ["0", "1"])
     images = [ax.images[0] for ax in figures["motion"].axes[:2]]
     assert images[0].get_clim() == images[1].get_clim() == (0, max(values.max() for values in found.motion))
-    assert not figures["motion"].axes[0].texts  # seven columns are too many for numbers
+    assert not figures["motion"].axes[0].texts  # no numbers with as many as seven columns
     (ax,) = figures["collapse"].axes
     x, y = ax.lines[0].get_data()
     assert ax.get_xlim()[0] < x.min() and x.max() < ax.get_xlim()[1]
@@ -220,7 +220,7 @@ def test_pictures_have_one_scale_and_room_for_what_they_show():
 
 
 @pytest.mark.parametrize("label, colours", [("angle", "twilight"), ("position 0", "twilight"), ("velocity", "viridis")])
-def test_factors_that_go_round_have_colours_that_do(label, colours):
+def test_cyclic_factors_have_cyclic_colours(label, colours):
     model = make_model(group="SE(2)")
     figure = latent_figure(model, th.randn(9, 12, generator=th.Generator().manual_seed(0)), np.arange(9.0), label)
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
@@ -230,7 +230,7 @@ def test_many_blocks_and_points_in_one_figure():
     model = make_model(group="T(2)", n_blocks=32)
     figure = latent_figure(model, th.randn(1000, 64, generator=th.Generator().manual_seed(0)))
     assert len(figure.axes) == 12 + 1 and "12 of 32" in figure._suptitle.get_text()
-    assert len(latent_figure(model, th.zeros(3, 64)).axes) == 13  # all the same
+    assert len(latent_figure(model, th.zeros(3, 64)).axes) == 13  # all points are equal
 
 
 @pytest.fixture
@@ -261,7 +261,7 @@ def test_command_line(trained, sb3_eqr, tmp_path):
         assert Image.open(tmp_path / "out" / f"{name}.png").size == (900, 600)
 
 
-def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
+def test_rl_zoos_files_next_to_the_model_are_used(tmp_path):
     folder = tmp_path / "Ring-v0_1" / "Ring-v0"
     folder.mkdir(parents=True)
     env = VecNormalize(make_vec_env(functools.partial(Ring, keys=False)))
@@ -293,7 +293,7 @@ def test_what_rl_zoo_left_beside_the_model_is_used(tmp_path):
         ("vecnormalize.pkl", pickle.dumps(functools.partial(print)), r"it names functools\.partial"),
     ],
 )
-def test_files_beside_the_model_are_looked_at_first(tmp_path, name, content, message):
+def test_files_next_to_the_model_are_checked_before_they_are_used(tmp_path, name, content, message):
     folder = tmp_path / "Ring-v0_1" / "Ring-v0"
     folder.mkdir(parents=True)
     model = make_model()
@@ -305,7 +305,7 @@ def test_files_beside_the_model_are_looked_at_first(tmp_path, name, content, mes
         loading.make_env(model, folder.parent / "best_model.zip")
 
 
-def test_the_algorithm_is_in_the_file(tmp_path):
+def test_the_algorithm_is_read_from_the_file(tmp_path):
     make_model(EqRRainbow).save(tmp_path / "rainbow")
     assert loading.find_algorithm(tmp_path / "rainbow.zip") == "eqr_rainbow"
     QRDQN("MlpPolicy", Ring(), device="cpu").save(tmp_path / "stock")
@@ -315,7 +315,7 @@ def test_the_algorithm_is_in_the_file(tmp_path):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """A folder with a model, and with a file that is no model."""
+    """A folder with a model and a truncated file."""
     folder = tmp_path_factory.mktemp("saved")
     make_model().save(folder / "model")
     (folder / "cut.zip").write_bytes(b"PK")
@@ -335,12 +335,12 @@ def saved(tmp_path_factory):
         ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not accept {'speed': 2}"),
         ("{model} --env Ring-v0 --steps 5", "visualize: --steps must be an integer >= 8, got 5"),
         ("{model} --env Ring-v0 --depth 0", "visualize: --depth must be an integer >= 1, got 0"),
-        ("{model} --env Ring-v0 --n-envs 0", "--n-envs: expected at least 1, found 0"),
+        ("{model} --env Ring-v0 --n-envs 0", "--n-envs must be >= 1, got 0"),
         ("{model} --env ALE/Pong-v5 --env-kwargs mode:1", "--env-kwargs must be empty for Atari"),
         ("{model} --algo dqn", "invalid choice: 'dqn'"),
     ],
 )
-def test_wrong_use_is_told(line, message, sb3_eqr, saved):
+def test_wrong_use_prints_an_error(line, message, sb3_eqr, saved):
     code, out = sb3_eqr(*line.format(model=saved / "model.zip", cut=saved / "cut.zip").split())
     assert code == 2
     assert re.search(message, out.err.replace("\n", " ")), out.err

@@ -1,4 +1,4 @@
-"""The doors to RL Zoo: registration, hyperparameter files, messages."""
+"""The interface to RL Zoo: registration, hyperparameter files, error messages."""
 
 import importlib.util
 import os
@@ -26,7 +26,7 @@ from tests.toys import ImageEnv
 
 @pytest.fixture
 def sb3_eqr(monkeypatch, capfd):
-    """Runs a command line; returns what it printed."""
+    """Runs a command line and returns its output."""
 
     def call(line):
         monkeypatch.setattr(sys, "argv", ["sb3-eqr", *line.split()])
@@ -45,31 +45,31 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_qrdqn --env CartPol-v1", "Did you mean 'CartPole-v1'?"),
         ("train --algo eqr_qrdqn --env Blackjack-v1", r"Tuple\(.* observation space is not supported. Wrap the environment"),
         ("train --algo eqr_qrdqn --gym-packages nopackage", "'nopackage' cannot be imported"),
-        ("train --algo eqr_qrdqn --conf-file nofile", "none of .*eqr_bbf"),
+        ("train --algo eqr_qrdqn --conf-file nofile", "--conf-file must be .* or one of .*eqr_bbf.*, got 'nofile'"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
-        ("train --algo eqr_rainbow --conf-file stock/qrdqn", "'n_quantiles' is no policy_kwargs of EqRRainbow"),
+        ("train --algo eqr_rainbow --conf-file stock/qrdqn", "'n_quantiles' is not an argument of EqRRainbow's policy"),
         ("train --algo eqr_qrdqn --conf-file eqr_qrdqn.yml", "no file 'eqr_qrdqn.yml'. Did you mean 'eqr_qrdqn'?"),
-        ("train --algo dqn --conf-file stock/qrdqn", "'n_quantiles' is no policy_kwargs of DQN"),
+        ("train --algo dqn --conf-file stock/qrdqn", "'n_quantiles' is not an argument of DQN's policy"),
         (
             "train --algo eqr_qrdqn -params n_stepz:3 gamma:0.9",
-            "'n_stepz' is no argument of EqRQRDQN. Did you mean 'n_steps'?",
+            "'n_stepz' is not an argument of EqRQRDQN. Did you mean 'n_steps'?",
         ),
         ("train --algo eqr_qrdqn --env MinAtar/Breakot-v1", "Did you mean 'MinAtar/Breakout-v1'?"),
         ("enjoy --algo eqr_qrdqn -f nowhere", "nowhere/eqr_qrdqn/?.* was not found.* train one first"),
         ("enjoy --algo eqr_qrdqn", "was not found.* train one first"),
-        ("train --algo eqr_qrdqn -i nothing.zip", "expected the path of a .zip file.*'nothing.zip'"),
+        ("train --algo eqr_qrdqn -i nothing.zip", "must be the path of a .zip file.*'nothing.zip'"),
         ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
         (
             "train --algo eqr_qrdqn -params learning_rate:'1e-3'",
             "learning_rate must be .* lin_ and a number .*write 1.0e-3.*got '1e-3'",
         ),
-        ("train --algo eqr_qrdqn -optimize --checkpoint-every 9", "expected one run, found a search"),
-        ("train --algo ppo --resume nowhere", "expected --algo eqr_qrdqn or eqr_rainbow, found ppo"),
+        ("train --algo eqr_qrdqn -optimize --checkpoint-every 9", "are for single runs, got a search"),
+        ("train --algo ppo --resume nowhere", "--algo must be eqr_qrdqn or eqr_rainbow .*, got ppo"),
         ("train --algo eqr_qrdqn --resume nowhere", "nowhere must be a checkpoint .*, got nothing"),
-        ("train --algo eqr_qrdqn --checkpoint-every 0", "expected at least 1 step, found 0"),
+        ("train --algo eqr_qrdqn --checkpoint-every 0", "--checkpoint-every must be >= 1 step, got 0"),
     ],
 )
-def test_wrong_use_is_told(sb3_eqr, capfd, line, message):
+def test_wrong_use_prints_an_error(sb3_eqr, capfd, line, message):
     with pytest.raises(SystemExit) as caught:
         sb3_eqr(line)
     assert caught.value.code == 2
@@ -77,10 +77,10 @@ def test_wrong_use_is_told(sb3_eqr, capfd, line, message):
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="for machines without a GPU")
-def test_a_gpu_that_is_not_there(sb3_eqr, capfd):
+def test_a_missing_gpu_prints_an_error(sb3_eqr, capfd):
     with pytest.raises(SystemExit):
         sb3_eqr("train --algo eqr_qrdqn --device cuda:1")
-    assert "cuda:1 was asked for, but PyTorch finds no GPU" in capfd.readouterr().err
+    assert "--device is cuda:1, but PyTorch finds no GPU" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_missing_extras_are_named(sb3_eqr, capfd, monkeypatch, package, line, ad
     assert re.search(advice, capfd.readouterr().err)
 
 
-def test_a_missing_simulator_is_told_with_its_advice(sb3_eqr, capfd, monkeypatch, tmp_path):
+def test_a_missing_simulator_prints_how_to_install_it(sb3_eqr, capfd, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "Box2D", None)
     for name in [name for name in sys.modules if name.startswith("gymnasium.envs.box2d")]:
         monkeypatch.delitem(sys.modules, name)
@@ -113,15 +113,15 @@ def test_a_missing_simulator_is_told_with_its_advice(sb3_eqr, capfd, monkeypatch
     assert "gymnasium[box2d]" in capfd.readouterr().err
 
 
-def test_unknown_keys_are_named_with_the_nearest(sb3_eqr, capfd, tmp_path):
+def test_unknown_keys_print_the_nearest_known_one(sb3_eqr, capfd, tmp_path):
     for entry, message in (
-        ({"learning_rat": 0.1}, "'learning_rat' is no argument of EqRQRDQN. Did you mean 'learning_rate'?"),
+        ({"learning_rat": 0.1}, "'learning_rat' is not an argument of EqRQRDQN. Did you mean 'learning_rate'?"),
         ({"env_wrapper": "rl_zoo3.wrappers.HistoryWrapper"}, "Use frame_stack: 4 instead"),
         ({"normalize": True, "frame_stack": 4}, "RL Zoo normalises before it stacks. Leave one of them out."),
-        ({"policy_kwargs": {"n_block": 3}}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
-        ({"policy_kwargs": "dict(n_block=3)"}, "'n_block' is no policy_kwargs of EqRQRDQN. Did you mean 'n_blocks'?"),
+        ({"policy_kwargs": {"n_block": 3}}, "'n_block' is not an argument of EqRQRDQN's policy. Did you mean 'n_blocks'?"),
+        ({"policy_kwargs": "dict(n_block=3)"}, "'n_block' is not an argument of EqRQRDQN's policy. Did you mean 'n_blocks'?"),
         ({"policy_kwargs": "dict(n_block=)"}, "cannot be evaluated"),
-        ({"seed": 3}, "'seed' cannot stand there: RL Zoo sets it by --seed"),
+        ({"seed": 3}, "'seed' is not allowed here, because RL Zoo sets it from --seed"),
     ):
         whole = {"policy": "MlpPolicy", "n_timesteps": 100, **entry}
         (tmp_path / "own.yml").write_text(yaml.dump({"CartPole-v1": whole}))
@@ -135,25 +135,25 @@ def test_unknown_keys_are_named_with_the_nearest(sb3_eqr, capfd, tmp_path):
     [
         ("CartPole-v1: {policy: MlpPolicy}", "the entry 'CartPole-v1' needs 'n_timesteps'"),
         ("CartPole-v1:", "the entry 'CartPole-v1' needs 'policy'"),
-        ("CartPole-v1: {policy: [}", "is no YAML"),
+        ("CartPole-v1: {policy: [}", "must be valid YAML"),
         ("", "no entry for 'CartPole-v1'"),
     ],
 )
-def test_broken_files_are_told(sb3_eqr, capfd, tmp_path, text, message):
+def test_invalid_files_print_an_error(sb3_eqr, capfd, tmp_path, text, message):
     (tmp_path / "own.yml").write_text(text)
     with pytest.raises(SystemExit):
         sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 --conf-file {tmp_path}/own.yml")
     assert message in capfd.readouterr().err
 
 
-def test_abbreviations_mean_what_they_mean_in_rl_zoo(sb3_eqr, capfd, tmp_path):
-    """A file given as --conf is used; wrong use under short names is told, too."""
+def test_options_can_be_abbreviated_as_in_rl_zoo(sb3_eqr, capfd, tmp_path):
+    """A file passed as --conf is used, and errors are also found in abbreviated options."""
     (tmp_path / "own.yml").write_text("CartPole-v1: {policy: MlpPolicy, n_timesteps: 30, gamma: 0.5}")
     sb3_eqr(f"train --alg eqr_qrdqn --conf {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
     assert EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip").gamma == 0.5
     with pytest.raises(SystemExit):
         sb3_eqr("train --alg eqr_qrdqn --hyperp n_stepz:3")
-    assert "'n_stepz' is no argument" in capfd.readouterr().err
+    assert "'n_stepz' is not an argument" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("algo", ["eqr_qrdqn", "eqr_rainbow"])
@@ -165,10 +165,10 @@ def test_abbreviations_mean_what_they_mean_in_rl_zoo(sb3_eqr, capfd, tmp_path):
         ("SmallImages-v0", "default-small-image", "CnnPolicy"),
     ],
 )
-def test_an_environment_without_an_entry_trains_by_the_one_for_its_observations(
+def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     sb3_eqr, tmp_path, monkeypatch, algo, env_id, name, policy
 ):
-    monkeypatch.setitem(gym.registry, "SmallImages-v0", gym.spec("CartPole-v1"))  # taken out again at the end
+    monkeypatch.setitem(gym.registry, "SmallImages-v0", gym.spec("CartPole-v1"))  # so that it is removed at the end
     gym.registry.pop("SmallImages-v0")
     gym.register("SmallImages-v0", lambda: ImageEnv((10, 10, 3)))
     out = sb3_eqr(f"train --algo {algo} --env {env_id} -n 90 -params learning_starts:40 --eval-freq -1 -f {tmp_path}")
@@ -187,8 +187,8 @@ def test_a_run_without_a_model_names_those_with_one(sb3_eqr, capfd, tmp_path):
     assert "There are models in 1 and 3: pass --exp-id." in capfd.readouterr().err
 
 
-def test_other_agents_pass(sb3_eqr, tmp_path):
-    """Policies that we do not know, and files that RL Zoo brings."""
+def test_other_agents_can_be_trained(sb3_eqr, tmp_path):
+    """With policies that are not of this package, and RL Zoo's own files."""
     own = {
         "policy": "MlpLstmPolicy",
         "n_timesteps": 16,
@@ -201,7 +201,7 @@ def test_other_agents_pass(sb3_eqr, tmp_path):
     assert (tmp_path / "ppo_lstm" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
 
 
-def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
+def test_train_enjoy_and_resume(sb3_eqr, tmp_path):
     folder = f"-f {tmp_path}"
     shown = sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 -n 128 --eval-freq 100 --eval-episodes 1 --seed 1 {folder}")
     assert str(configuration_files()["eqr_qrdqn"]) in shown
@@ -214,7 +214,7 @@ def test_train_enjoy_and_go_on(sb3_eqr, tmp_path):
     assert (tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip").exists()
 
 
-def test_a_stopped_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
+def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
     line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 1300 --eval-freq -1 -f {tmp_path}"
     sb3_eqr(f"{line} --seed 1 --checkpoint-every 500 -params learning_starts:100")
     whole = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
@@ -227,7 +227,7 @@ def test_a_stopped_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
         assert message in capfd.readouterr().err
     shown = sb3_eqr(f"{line} --resume {whole}/checkpoints/checkpoint-000000000512")
     assert "Resuming at step 512" in shown
-    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_3"  # the second one had too few steps to go
+    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_3"  # the second run raised, because it had no steps left
     first, second = (EqRQRDQN.load(folder / "CartPole-v1.zip") for folder in (whole, resumed))
     assert first.num_timesteps == second.num_timesteps == 1408  # a round of 128 steps
     for name, parameter in first.policy.state_dict().items():
@@ -248,8 +248,8 @@ def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):
 
 @pytest.mark.parametrize("name", zoo.AGENTS)
 def test_the_search_space_makes_agents(name):
-    """Every drawn set of parameters builds an agent; the converter gives the same from what the study has stored."""
-    zoo.register(policy_kwargs={"log_std": 1, "group": "T(2)"})  # the first is kept, the second is searched
+    """Every sample of parameters builds an agent, and the converter restores the sample from the study."""
+    zoo.register(policy_kwargs={"log_std": 1, "group": "T(2)"})  # the first is kept, the second is replaced by the search
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     groups = set()
     for _ in range(8):
@@ -265,7 +265,7 @@ def test_the_search_space_makes_agents(name):
 
 @pytest.mark.slow
 def test_the_flags_of_rl_zoo_together(sb3_eqr, tmp_path):
-    """Processes, normalisation, TensorBoard, checkpoints, a saved buffer: trained, played, gone on."""
+    """Training, playing and resuming with subprocesses, normalisation, TensorBoard, checkpoints and a saved buffer."""
     entry = {
         "policy": "MlpPolicy",
         "n_timesteps": 200,
@@ -300,7 +300,7 @@ def test_stacked_frames_and_named_configurations_on_atari(sb3_eqr, tmp_path):
 
 
 def run_sb3_eqr(line, folder, **environment):
-    """In a process of its own."""
+    """Run a command line in its own process."""
     command = [sys.executable, "-m", "sb3_eqr.zoo", *line.split()]
     return subprocess.Popen(
         command,
@@ -313,8 +313,8 @@ def run_sb3_eqr(line, folder, **environment):
 
 
 @pytest.mark.slow
-def test_two_processes_search_on_one_journal(tmp_path):
-    """Trials are shared, none is lost, none made twice."""
+def test_two_processes_share_one_search(tmp_path):
+    """Trials are shared; none is lost or repeated."""
     line = "train --algo eqr_qrdqn --env CartPole-v1 -n 120 -params learning_starts:100 -optimize --max-total-trials 6 "
     line += "--n-trials 6 --n-evaluations 2 --eval-episodes 1 --storage search.log --study-name s --no-optim-plots -f logs"
     processes = [run_sb3_eqr(f"{line} --seed {seed}", tmp_path) for seed in (1, 2)]
@@ -324,7 +324,7 @@ def test_two_processes_search_on_one_journal(tmp_path):
     trials = optuna.load_study(study_name="s", storage=storage).trials
     assert {trial.state for trial in trials} <= {optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED}
     told = [int(number) for text in shown for number in re.findall(r"Trial (\d+) (?:finished|pruned)", text)]
-    assert len(trials) >= 6 and sorted(told) == list(range(len(trials)))  # each once, in one of the two
+    assert len(trials) >= 6 and sorted(told) == list(range(len(trials)))  # each one once, in one of the two processes
 
 
 @pytest.mark.slow
@@ -338,8 +338,8 @@ def test_weights_and_biases_offline(tmp_path):
     assert list((tmp_path / "runs").rglob("events.*"))
 
 
-def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatch, capfd):
-    """A video; the folder for the Hub: card with our commands, video, model, settings."""
+def test_pushing_to_the_hub_and_loading_from_it(sb3_eqr, tmp_path, monkeypatch, capfd):
+    """A video, and the folder for the Hub with model card, video, model and settings."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     base = "--algo eqr_qrdqn --env CartPole-v1"
@@ -359,7 +359,7 @@ def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatc
     assert "sb3-eqr enjoy --algo eqr_qrdqn" in card and "rl_zoo3" not in card
     assert EqRQRDQN.load(folder / "eqr_qrdqn-CartPole-v1.zip").num_timesteps == 128  # a round
 
-    # The way back, with the folder in the place of the Hub.
+    # Downloading, with the folder in place of the Hub.
     fetch = f"load_from_hub {base} -f fetched -orga us"
     with pytest.raises(SystemExit):
         sb3_eqr(fetch)
@@ -378,8 +378,8 @@ def test_what_is_shared_is_built_before_it_is_sent(sb3_eqr, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("env_id", ["MinAtar/Breakout-v1", "BlindCliffwalk-v0"])
-def test_worlds_are_filmed(env_id):
-    """Every picture is uint8 and shows something."""
+def test_environments_can_be_rendered(env_id):
+    """Every frame is uint8 and not blank."""
     envs.register()
     env = gym.make(env_id, render_mode="rgb_array")
     if env_id.startswith("MinAtar"):
@@ -389,19 +389,19 @@ def test_worlds_are_filmed(env_id):
     picture = env.render()
     assert picture.dtype == np.uint8 and picture.shape in ((320, 320, 3), (32, 320, 3))
     assert picture.max() > 200 and picture.min() < 100
-    assert picture[0, 0].tolist() == picture[31, 31].tolist()  # 32 pixels for one
+    assert picture[0, 0].tolist() == picture[31, 31].tolist()  # one cell is 32 pixels wide
     check_env(env.unwrapped if env_id == "BlindCliffwalk-v0" else env, skip_render_check=True)
 
 
-def test_minatar_is_searched(sb3_eqr, tmp_path):
-    """The search keeps the small encoder of the entry: that of Atari has filters larger than these images."""
+def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
+    """The search keeps the entry's small encoder, because Atari's has filters larger than these images."""
     line = "train --algo eqr_rainbow --env MinAtar/Breakout-v1 -n 30 --seed 1 -params learning_starts:25 buffer_size:100"
     shown = sb3_eqr(f"{line} -optimize --n-trials 1 --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}")
     assert "Number of finished trials:  1" in shown
 
 
-def test_minatar_repeats_itself():
-    """One seed gives one game."""
+def test_minatar_is_deterministic_with_a_seed():
+    """The seed determines the game."""
     envs.register()
     games = []
     for seed in (5, 5, 6):
@@ -412,8 +412,8 @@ def test_minatar_repeats_itself():
     assert (games[0] == games[1]).all() and (games[0] != games[2]).any()
 
 
-def test_the_script_without_rl_zoo(monkeypatch):
-    """One line, not a traceback."""
+def test_the_command_without_rl_zoo(monkeypatch):
+    """Prints one line instead of a traceback."""
     for name in [name for name in sys.modules if name.startswith("sb3_eqr.zoo")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rl_zoo3.import_envs", None)
@@ -421,11 +421,11 @@ def test_the_script_without_rl_zoo(monkeypatch):
         cli.main()
 
 
-def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
+def test_plots_with_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
     import matplotlib.pyplot
 
     matplotlib.use("Agg")
-    monkeypatch.setattr("matplotlib.pyplot.show", matplotlib.pyplot.show)  # to be put back
+    monkeypatch.setattr("matplotlib.pyplot.show", matplotlib.pyplot.show)  # so that it is restored
     monkeypatch.chdir(tmp_path)
     line = "--env CartPole-v1 -n 64 --eval-freq 32 --eval-episodes 2"
     for algo in ("eqr_qrdqn", "qrdqn", "eqr_qrdqn", "qrdqn"):
@@ -436,7 +436,7 @@ def test_plots_beside_a_stock_agent(sb3_eqr, tmp_path, monkeypatch, capfd):
     assert (tmp_path / "curves.png").stat().st_size > 5_000
     sb3_eqr("plot_train -a eqr_qrdqn -e CartPole-v1 -f logs -w 2")
     sb3_eqr("all_plots -a eqr_qrdqn qrdqn -e CartPole-v1 -f logs")
-    assert (tmp_path / "all_plots-1.png").stat().st_size > 5_000  # no display: saved
+    assert (tmp_path / "all_plots-1.png").stat().st_size > 5_000  # saved, because there is no display
     sb3_eqr(f"train --algo dqn {line[:-1]}1")
     with pytest.raises(SystemExit):
         sb3_eqr("all_plots -a dqn -e CartPole-v1 -f logs --no-display")

@@ -1,4 +1,4 @@
-"""Every entry of every hyperparameter file builds its agent, by RL Zoo's own hands, and is trained by it."""
+"""RL Zoo can build and train the agent of every entry of every hyperparameter file."""
 
 import argparse
 import pathlib
@@ -22,7 +22,7 @@ ENVIRONMENTS = {
     *(f"MinAtar/{game}-v1" for game in GAMES),
 }
 ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
-CASES = [  # what stands for several environments is one object of YAML, and built once
+CASES = [  # an entry shared by several environments is one YAML object and built once
     (name, env_id)
     for name, entries in ENTRIES.items()
     for env_id in {id(entry): env_id for env_id, entry in entries.items()}.values()
@@ -30,7 +30,7 @@ CASES = [  # what stands for several environments is one object of YAML, and bui
 
 
 class Manager(ExperimentManager):
-    """RL Zoo's, which builds Atari's environment once for all entries that ask for the same: ALE takes long to load a game."""
+    """RL Zoo's manager, but entries with the same Atari environment share it, because ALE takes long to load a game."""
 
     built = {}
 
@@ -50,7 +50,7 @@ def algorithm_of(name):
     return "eqr_qrdqn" if name in ("eqr_qrdqn", "qrdqn") else "eqr_rainbow"
 
 
-def test_every_file_has_its_environments():
+def test_every_file_has_the_expected_environments():
     full = {"eqr_qrdqn", "eqr_rainbow", "stock/dqn", "stock/qrdqn"}
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS} == full
     minatar = {"atari", *(env_id for env_id in ENVIRONMENTS if env_id.startswith("MinAtar/"))}
@@ -76,7 +76,7 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
     if "env_wrapper" in written:
         assert model.observation_space.dtype == "uint8"
         assert model.observation_space.shape[1:] == ((84, 84) if entry == "atari" else (10, 10))
-    # It can act and be trained, on a batch that takes less time.
+    # It can act and be trained, here with a small batch to save time.
     model.learning_starts = 0
     model.train_freq = 24  # the longest n of these files is 20
     model._convert_train_freq()

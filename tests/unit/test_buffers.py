@@ -441,7 +441,7 @@ class TestPriorities:
         ({"n_steps": 0}, "n_steps must be an integer >= 1, got 0"),
         ({"prediction_depth": -1}, "prediction_depth must be an integer >= 0, got -1"),
         ({"gamma": 1.5}, "gamma"),
-        ({"frame_stack": 3}, "frame_stack: expected a divisor"),
+        ({"frame_stack": 3}, "frame_stack must divide"),
         ({"frame_stack": 0}, "frame_stack must be an integer >= 1, got 0"),
         ({"alpha": -0.1}, "alpha"),
         ({"beta": 2.0}, "beta"),

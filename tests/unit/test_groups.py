@@ -258,7 +258,7 @@ def test_bad_parameterization_and_generators():
     for generators in ([[1.0, 0.0]], [[[1.0, 0.0]]], [[[float("nan")]]]):
         with pytest.raises(ValueError, match=r"\(D, m, m\)"):
             MatrixLieGroup(generators)
-    with pytest.raises(ValueError, match="expected a basis, found 2 matrices that depend on each other"):
+    with pytest.raises(ValueError, match="generators must be linearly independent, got 2 linearly dependent matrices"):
         MatrixLieGroup([[[1.0]], [[2.0]]])
 
 

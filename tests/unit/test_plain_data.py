@@ -98,7 +98,7 @@ def test_forged_data_raises(forged):
 
 def test_a_file_cannot_choose_the_imported_module():
     program = "torch.utils.model_dump.__main__"
-    with pytest.raises(ValueError, match=r"must name a class that agents are made of, got torch\.utils\.model_dump"):
+    with pytest.raises(ValueError, match=r"must name a class that agents use, got torch\.utils\.model_dump"):
         decode({KIND: "class", "module": program, "name": "Module"})
     assert program not in sys.modules
     optimizer = {"module": "stable_baselines3.common.sb2_compat.rmsprop_tf_like", "name": "RMSpropTFLike"}
