@@ -1,9 +1,9 @@
 """
-Your own group: the affine group of the plane, given by its six generators, learned on a ball that slides over a torus.
+A custom group: the affine group of the plane, given by its six generators, learned on a ball that slides over a torus.
 
     python examples/affine_group.py          # two minutes
 
-Writes model.zip, actions.csv and affine_group.png to --out: what each action does to a square, and the latent states.
+Writes model.zip, actions.csv and affine_group.png (what each action does to a square, and the latent states) to --out.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from sb3_eqr.visualize.latents import action_elements, coordinate_names, coordin
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-# x -> A x + t as the matrix [[A, t], [0, 1]]: one generator per entry that may change, in the order that it is written.
+# x -> A x + t as the matrix [[A, t], [0, 1]]: one generator per free entry, row by row.
 GENERATORS = np.zeros((6, 3, 3))
 for number, (row, column) in enumerate([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]):
     GENERATORS[number, row, column] = 1.0
@@ -36,7 +36,7 @@ SQUARE = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) - 0.5  # around the origin
 def draw(model: EqRQRDQN, states: th.Tensor, positions: np.ndarray, path: pathlib.Path) -> None:
     """
     :param states: (N, D)
-    :param positions: of the ball there, (N, 2)
+    :param positions: positions of the ball in these states, (N, 2)
     """
     blocks = split(model, states)[0]
     linear, shift = frame(blocks.group, blocks.elements)  # (N, K, 2, 2), (N, K, 2)
@@ -63,17 +63,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=5_500, help="of random play")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/affine_group"), help="folder")
+    parser.add_argument("--steps", type=int, default=5_500, help="steps of random actions")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random generators")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/affine_group"), help="output folder")
     args = parser.parse_args()
-    th.set_num_threads(1)  # small networks are slower on two
+    th.set_num_threads(1)  # small networks are slower with two
     args.out.mkdir(parents=True, exist_ok=True)
     register()
     env = make_vec_env("SlidingBallTorus-v0", 16, args.seed)
     group = MatrixLieGroup(GENERATORS)
     model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, device="cpu")
-    model.save(args.out / "model")  # the generators travel with it
+    model.save(args.out / "model")  # the file includes the generators
 
     seen = play(model, make_vec_env("SlidingBallTorus-v0", 4, args.seed + 100), n_steps=1_200)
     print(diagnose(model, seen).summary)

@@ -1,5 +1,5 @@
 """
-How far the grey 84x84 screens of ALE's own vector environment are from those of SB3's wrappers, on the same actions.
+Compare the grey 84x84 screens of ALE's vector environment with those of SB3's wrappers, for the same actions.
 
     python examples/ale_pixels.py --games Pong Seaquest Qbert BattleZone MsPacman
 """
@@ -15,7 +15,7 @@ from sb3_eqr.envs.atari import FRAME_SKIP, SCREEN_SIZE, atari_env_id
 
 def screens(game: str, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    :return: screens of SB3's wrappers and of ALE's vector environment, (steps, 84, 84) each, of the first game played
+    :return: screens of SB3's wrappers and of ALE's vector environment in the first episode, (steps, 84, 84) each
     """
     from ale_py.vector_env import AtariVectorEnv
 
@@ -44,7 +44,7 @@ def screens(game: str, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    """Parse the command line, play, print."""
+    """Parse the command line, run the games, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--games", nargs="+", default=["Pong", "Seaquest", "Qbert", "BattleZone", "MsPacman"])
     parser.add_argument("--steps", type=int, default=300)

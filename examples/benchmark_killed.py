@@ -1,6 +1,6 @@
 """
-Does a benchmark that is killed end with the scores of one that is not? SIGKILL at random moments, then two benchmarks at
-once on one folder, each compared with an undisturbed one.
+Does a benchmark that is killed and resumed have the same scores as an undisturbed one? Tests SIGKILL at random times, then two
+benchmarks at once in one folder.
 
     python examples/benchmark_killed.py FOLDER [--kills 10] [--seed 0]
 """
@@ -20,7 +20,7 @@ N_RUNS = 2 * len(AGENTS)
 
 def start(folder: pathlib.Path) -> subprocess.Popen:
     """
-    :return: a benchmark on the suite smoke
+    :return: the process of a benchmark on the suite smoke
     """
     line = [
         "benchmark",
@@ -52,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the times of kills")
     args = parser.parse_args()
     rng = random.Random(args.seed)
 
@@ -68,7 +68,7 @@ def main() -> None:
         process = start(killed)
         try:
             process.wait(wait)
-            print(f"{kill}: ended by itself within {wait:.0f} s")
+            print(f"{kill}: finished within {wait:.0f} s")
             continue
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)

@@ -1,11 +1,11 @@
 """
-Prioritised against uniform replay on the blind cliffwalk (Schaul et al. 2016, Figure 1).
+Prioritised compared with uniform replay on the blind cliffwalk (Schaul et al. 2016, Figure 1).
 
     python examples/blind_cliffwalk.py --seeds 10
 
-The replay buffer holds every one of the 2ⁿ action sequences, each played to its end, in random order: the one
-success is a single transition among 2ⁿ⁺¹ - 2. Counted are the updates of a tabular EqRRainbow until the mean square
-error of all its Q values is below 0.001.
+The replay buffer holds the full episodes of all 2ⁿ action sequences, in random order: the only success is a single
+transition among 2ⁿ⁺¹ - 2. The script counts the updates of a tabular EqRRainbow until the mean square error of all its
+Q values is below 0.001.
 """
 
 import argparse
@@ -26,7 +26,7 @@ MOST_UPDATES = 100_000
 
 def make_model(n_states: int, seed: int, prioritized: bool) -> EqRRainbow:
     """
-    :return: an agent without hidden layers on one-hot states, its replay buffer full
+    :return: an agent without hidden layers on one-hot states, with a full replay buffer
     """
     env = BlindCliffwalk(n_states, seed)
     model = EqRRainbow(
@@ -58,7 +58,7 @@ def make_model(n_states: int, seed: int, prioritized: bool) -> EqRRainbow:
 
 def updates_needed(n_states: int, seed: int, prioritized: bool) -> int:
     """
-    :return: number of gradient steps until the Q values are right
+    :return: number of updates until the error of the Q values is below ``TOLERANCE``
     """
     model = make_model(n_states, seed, prioritized)
     states = th.arange(n_states)
@@ -73,7 +73,7 @@ def updates_needed(n_states: int, seed: int, prioritized: bool) -> int:
 
 def milliseconds_per_sample(n_states: int, rounds: int = 200) -> dict[str, float]:
     """
-    :return: median cost of a batch, its new priorities included; the ways of drawing take turns
+    :return: median time of a batch for each way of sampling, including new priorities; the two are timed alternately
     """
     buffers = {way: make_model(n_states, 0, way == "prioritised").replay_buffer for way in ("uniform", "prioritised")}
     timings: dict[str, list[float]] = {way: [] for way in buffers}
@@ -90,11 +90,11 @@ def milliseconds_per_sample(n_states: int, rounds: int = 200) -> dict[str, float
 
 
 def main() -> None:
-    """Count the updates of each way of drawing, print medians."""
+    """Count the updates for each way of sampling, print medians."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--states", type=int, nargs="+", default=[6, 8, 10])
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--json", metavar="FILE", help="write the counts to this file, too")
+    parser.add_argument("--json", metavar="FILE", help="also write the counts to this file")
     args = parser.parse_args()
     th.set_num_threads(1)
     results = []

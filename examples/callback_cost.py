@@ -1,5 +1,5 @@
 """
-What LatentCallback costs at its default interval: one look, beside the training steps until the next.
+The cost of LatentCallback at its default interval: the time of one call, compared with that of the training steps in between.
 
     python examples/callback_cost.py     # the table of docs/results/representation.md, some minutes
 """
@@ -38,7 +38,7 @@ def breakout() -> EqRAlgorithm:
     return EqRRainbow("MlpPolicy", env, seed=0, learning_starts=500, buffer_size=5_000)
 
 
-# name -> (agent, steps before, steps that are timed)
+# name -> (agent, warm-up steps, timed steps)
 AGENTS: dict[str, tuple[Callable[[], EqRAlgorithm], int, int]] = {
     "EqRQRDQN, Pong": (pong, 300, 60),
     "EqRQRDQN, CartPole": (cartpole, 768, 1_024),
@@ -48,7 +48,7 @@ AGENTS: dict[str, tuple[Callable[[], EqRAlgorithm], int, int]] = {
 
 def measure(make: Callable[[], EqRAlgorithm], before: int, timed: int, pictures: bool) -> tuple[float, float, float]:
     """
-    :return: seconds per step, seconds per look, share of the training
+    :return: seconds per step, seconds per call, share of the training time
     """
     model = make()
     with tempfile.TemporaryDirectory() as folder:
@@ -66,9 +66,9 @@ def measure(make: Callable[[], EqRAlgorithm], before: int, timed: int, pictures:
 
 
 def main() -> None:
-    """Every agent, with and without pictures."""
+    """Measure every agent, with and without figures."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
-    parser.add_argument("--threads", type=int, default=1, help="of PyTorch (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, help="PyTorch threads (default: 1)")
     args = parser.parse_args()
     th.set_num_threads(args.threads)
     register()

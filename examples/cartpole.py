@@ -1,10 +1,10 @@
 """
-Agents on CartPole-v1, with their learning curves.
+Train agents on CartPole-v1, with learning curves.
 
     python examples/cartpole.py --seeds 0 1 2 3 4                      # EqRQRDQN, 30,000 steps
     python examples/cartpole.py --agent eqr_rainbow --seeds 0 1 2 3 4  # EqRRainbow with the same settings
     python examples/cartpole.py --agent qrdqn --seeds 0 1 2 3 4        # sb3_contrib's QRDQN with the same settings
-    python examples/cartpole.py --agent plain_rainbow --seeds 0 1 2 3 4    # EqRRainbow, every switch off: a categorical DQN
+    python examples/cartpole.py --agent plain_rainbow --seeds 0 1 2 3 4    # EqRRainbow, all extensions off: a categorical DQN
     python examples/cartpole.py --agent dqn --seeds 0 1 2 3 4              # SB3's DQN with the same settings
 
 The values of RL Zoo's tuned entries for CartPole-v1 are marked (Zoo); the others of EqRQRDQN were chosen by hand
@@ -43,7 +43,7 @@ SETTINGS = {
 }
 
 
-DQN_SETTINGS = {  # (Zoo), all of them
+DQN_SETTINGS = {  # all (Zoo)
     "learning_rate": 2.3e-3,
     "batch_size": 64,
     "buffer_size": 100_000,
@@ -88,7 +88,7 @@ def train(agent: str, seed: int, steps: int) -> dict:
     :return: the learning curve of one seed, and the mean return of 100 episodes of the trained agent
     """
     eval_env = make_vec_env("CartPole-v1", 20, seed=1_000 + seed)
-    with tempfile.TemporaryDirectory() as folder:  # EvalCallback keeps its results only where it may write them
+    with tempfile.TemporaryDirectory() as folder:  # EvalCallback keeps its results only if it can write them
         curve = EvalCallback(eval_env, eval_freq=1_000, n_eval_episodes=20, log_path=folder, verbose=0)
         model = make_model(agent, seed).learn(steps, callback=curve)
     mean, std = evaluate_policy(model, make_vec_env("CartPole-v1", 20, seed=2_000 + seed), n_eval_episodes=100)
@@ -106,7 +106,7 @@ def train(agent: str, seed: int, steps: int) -> dict:
 
 
 def main() -> None:
-    """Train each seed and print a line for it."""
+    """Train each seed and print its metrics."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split("\n")[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--agent", choices=STEPS_OF, default="eqr_qrdqn")

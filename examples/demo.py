@@ -1,15 +1,15 @@
 """
 An EqR agent on one environment, from training to a plot and a video of what it observes and predicts.
 
-    python examples/demo.py --game CartPole-v1                # EqRQRDQN, 15,000 steps: enough to learn it
+    python examples/demo.py --game CartPole-v1                # EqRQRDQN, 15,000 steps, enough to learn it
     python examples/demo.py --game Pong                       # as many steps as fit into --minutes
     python examples/demo.py --game Boxing --steps 100000      # the full benchmark
     python examples/demo.py --config eqr_rainbow --steps 3000
     python examples/demo.py --config eqr_bbf --width-scale 1 --steps 3000    # narrow enough for two cores
 
 Writes model.zip, progress.csv, training.png, latents.mp4 and latents.gif to --out, and prints what the latent states have
-learned. The video shows the environment on the left and the blocks of the agent's latent state on the right: now, and as its
-latent model predicted them five steps before.
+learned. The video shows the environment on the left and the blocks of the agent's latent state on the right, both current
+and as predicted by the latent model five steps before.
 """
 
 import argparse
@@ -44,19 +44,19 @@ LOSSES = {
     "train/symmetry_loss": "GET loss",
     "train/reward_loss": "reward loss",
 }
-EVALUATION_SECONDS = 60  # kept free at the end of the minutes
+EVALUATION_SECONDS = 60  # reserved at the end of --minutes
 DIAGNOSIS_STEPS = 500
-CLASSIC_STEPS = 15_000  # of CartPole's entry
-ANIMATION_SECONDS = 15  # as well
+CLASSIC_STEPS = 15_000  # as in CartPole's entry
+ANIMATION_SECONDS = 15  # reserved at the end of --minutes
 ANIMATION_STEPS = 200
 RESULTS = ("training.png", "latents.mp4", "latents.gif")
 CHECKPOINT_STEPS = 10_000
-FULL_STEPS = 100_000  # what the configurations are for
-SHORT_LEARNING_STARTS = 400  # random steps at the start of a run of minutes; Table 5's 2,000 would be most of it
+FULL_STEPS = 100_000  # number of steps that the configurations are for
+SHORT_LEARNING_STARTS = 400  # for runs of a few minutes; Table 5's 2,000 would be most of their steps
 
 
 class Demo(BaseCallback):
-    """Writes a row of metrics every so many steps, keeps the score of every episode, stops when the time is over."""
+    """Writes a row of metrics every ``log_every`` steps, records the score of every episode, stops after ``seconds``."""
 
     def __init__(self, log_every: int, seconds: float | None):
         super().__init__()
@@ -66,7 +66,7 @@ class Demo(BaseCallback):
 
     def _on_training_end(self) -> None:
         if self.deadline is not None and time.monotonic() >= self.deadline:
-            print(f"stopped at {self.num_timesteps} steps: the time is over", flush=True)
+            print(f"Stopped at {self.num_timesteps} steps: the time is up.", flush=True)
 
     def _on_step(self) -> bool:
         self.scores += [(self.num_timesteps, info["episode"]["r"]) for info in self.locals["infos"] if "episode" in info]
@@ -76,7 +76,7 @@ class Demo(BaseCallback):
 
 
 def is_atari(game: str) -> bool:
-    """Whether it is a game of ALE, rather than an environment of gymnasium with an entry of its own."""
+    """Whether it is an Atari game, rather than a gymnasium environment with an entry of its own."""
     return game not in gym.registry
 
 
@@ -90,7 +90,7 @@ def make_env(game: str, n_envs: int = 1, seed: int = 0, training: bool = False, 
 def make_model(config: str, width_scale: float | None, game: str, seed: int, **changes) -> EqRAlgorithm:
     """
     :param config: a file in zoo_hyperparams
-    :param width_scale: of an "impala" trunk; its head is 512 times as wide, as BBF's is
+    :param width_scale: width of an "impala" trunk; its head has 512 times as many units, as in BBF
     """
     if width_scale is not None:
         network = {"features_extractor_kwargs": {"width_scale": width_scale}, "net_arch": [round(512 * width_scale)]}
@@ -103,7 +103,7 @@ def make_model(config: str, width_scale: float | None, game: str, seed: int, **c
 
 def steps_that_fit(config: str, width_scale: float | None, game: str, seconds: float) -> int:
     """
-    :return: how many steps a run of so many seconds has here, by the speed of a few updates
+    :return: number of steps that fit into ``seconds`` on this machine, estimated from a few updates
     """
     model = make_model(config, width_scale, game, 0, learning_starts=30, buffer_size=100)
     model.learn(36)  # warm up
@@ -121,8 +121,8 @@ def draw(
     title: str,
     path: pathlib.Path,
 ) -> None:
-    """One figure: the score of every episode, the evaluation at the end, and the losses over steps."""
-    shown = {key: name for key, name in LOSSES.items() if key in progress}  # no update, or a loss that is off: not there
+    """Plot the scores of episodes, the final evaluation, and the losses over steps."""
+    shown = {key: name for key, name in LOSSES.items() if key in progress}  # absent without updates, or if a loss is off
     figure, axes = plt.subplots(1 + len(shown), 1, figsize=(7, 3 + 2 * len(shown)), sharex=True, layout="constrained")
     axes = np.atleast_1d(axes)
     figure.suptitle(title)
@@ -157,9 +157,9 @@ def draw(
 
 def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, float]], out: pathlib.Path) -> None:
     """
-    Evaluate, draw, film, diagnose.
+    Evaluate the agent, plot, record a video, print the diagnostics.
 
-    :param scores: of the episodes in training, (step, raw score)
+    :param scores: scores of the training episodes, (step, raw score)
     """
     env = make_env(args.game, args.eval_episodes, args.seed + 10_000)
     with tqdm(total=args.eval_episodes, desc="evaluation", unit="episode") as bar:
@@ -176,34 +176,34 @@ def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, 
     progress = pd.read_csv(out / "progress.csv")
     draw(progress, scores, float(np.mean(found)), model.learning_starts, title, out / "training.png")
     env = make_env(args.game, render_mode="rgb_array")
-    # As it explores: without noise a young agent repeats one action.
+    # With exploration noise: without it, an agent after little training repeats one action.
     record(model, env, out / "latents", ANIMATION_STEPS, seed=args.seed + 20_000, deterministic=False)
     print(diagnose(model, play(model, env, DIAGNOSIS_STEPS, seed=args.seed + 30_000)).summary)
 
 
 def main() -> None:
-    """Train, save, evaluate, draw, film, diagnose."""
+    """Train, save, evaluate, plot, record a video, print the diagnostics."""
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--game", default="Pong", help="any of ALE's games, or CartPole-v1")
     parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn", help="see docs/configurations.md")
     parser.add_argument(
-        "--width-scale", type=float, help="of eqr_bbf, whose head gets 512 times as wide; 4 in its paper, 1 fits two cores"
+        "--width-scale", type=float, help="width of eqr_bbf's networks; its paper has 4, and 1 is fast enough on two cores"
     )
-    parser.add_argument("--steps", type=int, help="100000 is the benchmark; without it, as many as fit into --minutes")
-    parser.add_argument("--minutes", type=float, default=5.5, help="for everything, where --steps is not given")
-    parser.add_argument("--eval-episodes", type=int, default=3, help="episodes at the end")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    parser.add_argument("--steps", type=int, help="100000 is the benchmark; if not given, as many as fit into --minutes")
+    parser.add_argument("--minutes", type=float, default=5.5, help="total time, if --steps is not given")
+    parser.add_argument("--eval-episodes", type=int, default=3, help="episodes of the final evaluation")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random generators")
     parser.add_argument(
         "--out",
         type=pathlib.Path,
-        help="folder for model.zip, progress.csv, training.png, latents.mp4 and latents.gif; demo_results/<game> or "
-        "demo_results/<game>-<config> if not given",
+        help="folder for model.zip, progress.csv, training.png, latents.mp4 and latents.gif; if not given, "
+        "demo_results/<game> or demo_results/<game>-<config>",
     )
     args = parser.parse_args()
     if args.width_scale is not None and args.config != "eqr_bbf":
-        parser.error(f"--width-scale: expected --config eqr_bbf, whose networks have a width, found {args.config}")
+        parser.error(f"--config must be eqr_bbf with --width-scale, got {args.config}")
     game = atari_env_id(args.game)[4:-3] if is_atari(args.game) else args.game
     out = args.out or pathlib.Path("demo_results") / (game if args.config == "eqr_qrdqn" else f"{game}-{args.config}")
     settings: dict = {}
@@ -224,7 +224,7 @@ def main() -> None:
     callbacks: list[BaseCallback] = [demo]
     if args.steps > CHECKPOINT_STEPS:
         callbacks.append(CheckpointCallback(CHECKPOINT_STEPS, str(out / "checkpoints"), save_replay_buffer=True))
-    for name in RESULTS:  # of a run before
+    for name in RESULTS:  # of an earlier run
         (out / name).unlink(missing_ok=True)
     model.learn(args.steps, callback=callbacks, progress_bar=True)
     if model._n_updates == 0:

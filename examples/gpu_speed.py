@@ -1,13 +1,13 @@
 """
-Compares eager updates with updates captured as a CUDA graph (``cuda_graph=True``), on one GPU.
+Compare eager updates with updates captured as a CUDA graph (``cuda_graph=True``), on one GPU.
 
     PYTHONPATH=. python examples/gpu_speed.py                   # check and steps, a few minutes
     PYTHONPATH=. python examples/gpu_speed.py --parts run       # Atari 100K on Pong; the same command resumes it
-    PYTHONPATH=. python examples/gpu_speed.py --parts seeds     # several runs side by side
+    PYTHONPATH=. python examples/gpu_speed.py --parts seeds     # several runs in parallel
     PYTHONPATH=. python examples/gpu_speed.py --device cpu --smoke --parts check steps run seeds   # does the script run?
 
-``run`` and ``seeds`` capture their updates; with ``--eager`` they do not. Tables are printed, and written to ``--json`` beside
-those of earlier calls. The exit status is 1 if ``check`` fails.
+``run`` and ``seeds`` capture their updates, unless ``--eager`` is given. Tables are printed, and added to those of earlier
+calls in ``--json``. The exit status is 1 if ``check`` fails.
 """
 
 import argparse
@@ -29,12 +29,12 @@ from sb3_eqr import EqRRainbow
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.envs import make_atari100k_env
 
-Job = argparse.Namespace  # the command line's options, and ``sizes``
+Job = argparse.Namespace  # the command-line options, and ``sizes``
 GAME, ATARI_100K, WAYS = "Pong", 100_000, {"eager": False, "captured": True}
 STEPS_PER_CALL = 2  # updates per environment step, Table 5
-WARM_UP = 12  # updates after which one has been captured
-TOLERANCE = 1e-5  # of parameters, where eager updates repeat themselves exactly
-START_UP = 150.0  # seconds for processes to start, to learn a little and to capture
+WARM_UP = 12  # updates, by the end of which the graph is captured
+TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
+START_UP = 150.0  # seconds for processes to start, to train a little and to capture
 SPAWN = multiprocessing.get_context("spawn")
 FULL: dict[str, Any] = {"agent": {}, "stored": 2_500, "updates": 100, "rounds": 7, "calls": 25, "starts": 200, "steps": 500}
 FULL |= {"total": ATARI_100K, "learning_starts": 2_000, "processes": (1, 4, 8, 16), "seconds": 40.0}
@@ -48,13 +48,13 @@ def train(model: Any) -> None:
 
 
 def capture_of(model: Any) -> str:
-    """What became of ``cuda_graph=True``: "captured", or why updates are eager."""
+    """The state of ``cuda_graph=True``: "captured", or why updates are eager."""
     found = model._captured
     return "not asked for" if found is None else found.failure or ("captured" if found._graph else "not yet captured")
 
 
 def updated(job: Job, name: str, n_updates: int, cuda_graph: bool) -> Any:
-    """An agent after some updates on random frames. Between them frames are added, and the buffer's ring is overwritten."""
+    """An agent after some updates on random frames. Frames are added between updates, so that old ones are overwritten."""
     kwargs = {**job.sizes["agent"], "buffer_size": job.sizes["stored"] + 5}
     model = make_agent(name, device=job.device, cuda_graph=cuda_graph, **kwargs)
     fill(model.replay_buffer, job.sizes["stored"])
@@ -65,7 +65,7 @@ def updated(job: Job, name: str, n_updates: int, cuda_graph: bool) -> Any:
 
 
 def check(job: Job) -> Iterator[Table]:
-    """Captured updates are the eager ones: no further from them than eager updates are from their own repetition."""
+    """Check that captured updates differ from eager ones no more than eager ones differ from their own repetition."""
     rows = []
     for name in EQR_AGENTS:
         models = [updated(job, name, job.sizes["updates"], cuda_graph) for cuda_graph in (False, False, True)]
@@ -79,7 +79,7 @@ def check(job: Job) -> Iterator[Table]:
 
 
 def steps(job: Job) -> Iterator[Table]:
-    """What an update costs, and a step of the environment with its updates."""
+    """The time of an update, and of an environment step with its updates."""
     n_calls = job.sizes["calls"]
     for name in EQR_AGENTS:
         models = {way: updated(job, name, WARM_UP, cuda_graph) for way, cuda_graph in WAYS.items()}
@@ -100,7 +100,7 @@ def steps(job: Job) -> Iterator[Table]:
 
 
 def make_run(job: Job, **kwargs: Any) -> Any:
-    """An agent on the game, without a log."""
+    """An agent on the game, which logs nothing."""
     settings = {"seed": 0, "device": job.device, "cuda_graph": not job.eager, **job.sizes["agent"], **kwargs}
     model = EqRRainbow("CnnPolicy", make_atari100k_env(GAME, seed=settings["seed"]), **settings)
     model.set_logger(configure(None, []))
@@ -108,21 +108,21 @@ def make_run(job: Job, **kwargs: Any) -> Any:
 
 
 def learn(model: Any, n_steps: int, deadline: float = float("inf")) -> float:
-    """Continue training, for ``n_steps`` or until ``deadline``; returns the seconds that it took."""
+    """Train for ``n_steps`` or until ``deadline``; returns the elapsed seconds."""
     start = timer()  # waits for the GPU
     model.learn(n_steps, callback=lambda *_: time.time() < deadline, reset_num_timesteps=False)
     return timer() - start
 
 
 def learning(job: Job, **kwargs: Any) -> Any:
-    """An agent past its random steps, whose updates are captured by now."""
+    """An agent after its random steps, whose updates are already captured."""
     model = make_run(job, learning_starts=job.sizes["starts"], exploration_initial_eps=0.0, **kwargs)
     learn(model, job.sizes["starts"] + WARM_UP)
     return model
 
 
 def run(job: Job) -> Iterator[Table]:
-    """Atari 100K: trains for ``--minutes`` from where the last call stopped, and saves."""
+    """Atari 100K: train for ``--minutes``, resuming the last call's run, and save."""
     path, total = job.folder / f"{GAME}{'_eager' * job.eager}{'_smoke' * job.smoke}", job.sizes["total"]
     model = make_run(job, learning_starts=job.sizes["learning_starts"])
     model.seconds_so_far = 0.0  # saved with the model
@@ -140,7 +140,7 @@ def run(job: Job) -> Iterator[Table]:
 
 
 def one_of_many(job: Job, seed: int, barrier: Any, rates: Any) -> None:
-    """A process: trains once all of them are ready, and reports its environment steps per second."""
+    """One process: train once all processes are ready, and report the environment steps per second."""
     th.set_num_threads(1)
     model = learning(job, seed=seed)
     before = model.num_timesteps
@@ -150,7 +150,7 @@ def one_of_many(job: Job, seed: int, barrier: Any, rates: Any) -> None:
 
 
 def seeds(job: Job) -> Iterator[Table]:
-    """Runs side by side, each in a process of its own."""
+    """Parallel runs, each in a separate process."""
     rows = []
     for n in job.sizes["processes"]:
         barrier, rates = SPAWN.Barrier(n), SPAWN.Queue()
@@ -167,18 +167,18 @@ PARTS: dict[str, Callable[[Job], Iterator[Table]]] = {"check": check, "steps": s
 
 
 def main() -> None:
-    """Measure what is asked for; print and write each table as soon as it is complete."""
-    parser = argparse.ArgumentParser(description="Compares eager updates with updates captured as a CUDA graph.")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["check", "steps"], help="(default: check steps)")
-    parser.add_argument("--json", type=pathlib.Path, default=pathlib.Path("gpu_speed.json"), help="(default: %(default)s)")
-    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("gpu_runs"), help="for the checkpoint of run")
+    """Measure the requested parts; print and write each table as soon as it is complete."""
+    parser = argparse.ArgumentParser(description="Compare eager updates with updates captured as a CUDA graph.")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=["check", "steps"], help="default: check steps")
+    parser.add_argument("--json", type=pathlib.Path, default=pathlib.Path("gpu_speed.json"), help="default: %(default)s")
+    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("gpu_runs"), help="folder of run's checkpoint")
     parser.add_argument("--minutes", type=float, default=8.0, help="training time of run in this call (default: 8)")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--eager", action="store_true", help="do not capture updates in run and seeds")
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes: does the script run?")
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes, to test the script")
     job = parser.parse_args()
     if job.device == "cuda" and not th.cuda.is_available():
-        parser.error("--device must be cpu, because PyTorch sees no GPU here. --device cpu --smoke tries the script")
+        parser.error("--device must be cpu, because PyTorch finds no GPU. --device cpu --smoke tests the script")
     job.sizes, failed = SMOKE if job.smoke else FULL, False
     about = {"torch": th.__version__, "cuda": th.version.cuda, "cpus": multiprocessing.cpu_count(), "smoke": job.smoke}
     about["device"] = "cpu" if job.device == "cpu" else th.cuda.get_device_name()

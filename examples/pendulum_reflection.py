@@ -4,8 +4,8 @@ Example 1 of the paper: does ρ negate the torque of a pendulum without gravity 
     python examples/pendulum_reflection.py --seeds 0 1      # the table of docs/representation.md, some minutes per group
 
 For pairs of a state and its mirror image, ρ(τ_g) κ(s, a) is compared with κ at the mirrored state for the same torque and for
-the opposite one, by where each moves the mirrored state: its distance, relative to that between the two torques. The answer
-would be 0 to the torque that ρ gives and 1 to the other.
+the opposite one: the distance between the states to which they move the mirrored state, relative to that between the two
+torques. Ideally it is 0 to the torque that ρ gives and 1 to the other.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def images(world: PixelPendulum, angles: np.ndarray, velocities: np.ndarray) -> 
 
 
 def measure(model: EqRQRDQN, world: PixelPendulum, seed: int) -> dict[str, Any]:
-    """Where ρ(τ_g) κ(s, a) moves the mirrored state, beside where the torques do."""
+    """Compare where ρ(τ_g) κ(s, a) and the two torques move the mirrored state."""
     rng = np.random.default_rng(seed)
     angles, velocities = rng.uniform(-np.pi, np.pi, N_STATES), rng.uniform(-4, 4, N_STATES)
     x = encode(model, images(world, angles, velocities))  # (N, D)
@@ -72,12 +72,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS), help="of the blocks")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of everything random")
-    parser.add_argument("--steps", type=int, default=5_500, help="of random play")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/pendulum.jsonl"), help="a line per run")
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS), help="groups of the blocks")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of all random generators")
+    parser.add_argument("--steps", type=int, default=5_500, help="steps of random actions")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/pendulum.jsonl"), help="output file")
     args = parser.parse_args()
-    th.set_num_threads(1)  # small networks are slower on two
+    th.set_num_threads(1)  # small networks are slower with two
     register()
     args.out.parent.mkdir(parents=True, exist_ok=True)
     for group in args.groups:
@@ -90,7 +90,7 @@ def main() -> None:
                 n_blocks=GROUPS[group],
                 total_timesteps=args.steps,
                 symmetry_coef=1.0,
-                state_dependent_actions=True,  # what a torque does to the angle depends on the velocity
+                state_dependent_actions=True,  # the effect of a torque on the angle depends on the velocity
                 seed=seed,
                 device="cpu",
             )

@@ -1,5 +1,5 @@
 """
-What random play scores on the games of the suites `minatar` and `classic`: the 0 of their normalisation.
+The scores of random play on the games of the suites `minatar` and `classic`, which are the 0 of their normalisation.
 
     python examples/random_play.py [--episodes 1000]
 """
@@ -16,7 +16,7 @@ def play(env_id: str, n_episodes: int, max_steps: int | None) -> np.ndarray:
     """
     :param env_id: name of the environment
     :param n_episodes: number of episodes, with the seeds 0, 1, ...
-    :param max_steps: of an episode
+    :param max_steps: maximum number of steps per episode
     :return: scores, (n_episodes,)
     """
     env = gym.make(env_id, max_episode_steps=max_steps)
@@ -33,7 +33,7 @@ def play(env_id: str, n_episodes: int, max_steps: int | None) -> np.ndarray:
 
 
 def main() -> None:
-    """Play and print a Markdown table."""
+    """Run the episodes and print a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=1_000)
     args = parser.parse_args()

@@ -1,11 +1,11 @@
 """
 Example 2 and Figure 3 of the paper: the latent space of a sliding ball, learned from random actions without reward.
 
-    python examples/sliding_ball.py                                  # the ball, SO(2), one seed: two minutes
+    python examples/sliding_ball.py                                  # the ball, SO(2), one seed, two minutes
     python examples/sliding_ball.py --seeds 0 1 2 3 4 --arms each    # the table of docs/representation.md
     python examples/sliding_ball.py --world torus                    # a torus, two blocks
 
-Writes a model and a figure per run and results.jsonl (a line per run; runs that are in it are not repeated) to --out.
+Writes a model and a figure per run, and results.jsonl with a line per run, to --out. Finished runs are not repeated.
 """
 
 import argparse
@@ -45,10 +45,10 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 IDS = {"ball": "SlidingBall-v0", "torus": "SlidingBallTorus-v0"}
 DIMENSIONS = {"ball": 1, "torus": 2}
-GRID = {"ball": 192, "torus": 48}  # positions per axis that the learned map is looked at
+GRID = {"ball": 192, "torus": 48}  # positions per axis at which the learned map is evaluated
 AXES = ("vertical", "horizontal")
 STEPS_AHEAD = 20
-N_ENVS = 16  # at once: random play of one alone sees little of a torus
+N_ENVS = 16  # in parallel, as random actions in a single one cover little of a torus
 WIDTH = 0.25  # of the ball, in loops
 
 
@@ -62,7 +62,7 @@ def images(world: SlidingBall, positions: np.ndarray) -> th.Tensor:
 
 def turns(model: EqRQRDQN, elements: th.Tensor) -> np.ndarray:
     """
-    :param elements: states, (N, D), or actions' elements, (N, A, K, 2, 2)
+    :param elements: states, (N, D), or elements of actions, (N, A, K, 2, 2)
     :return: the angles of the K blocks, in turns, (N, K) or (N, A, K)
     """
     blocks = split(model, elements)[0]
@@ -78,12 +78,12 @@ def grid(axes: int, per_axis: int) -> np.ndarray:
 
 def linearity(angle: np.ndarray, positions: np.ndarray) -> tuple[list[int], float]:
     """
-    How well a block's angle is a whole number of turns per loop of each axis, plus a constant: circular R² is
-    1 - the mean square of what is left over that of a uniform angle, 1/12 of a turn squared.
+    How well a block's angle is an integer number of turns per loop of each axis, plus a constant. Circular R² is 1 minus
+    the mean square of the residual, divided by that of a uniform angle, 1/12 of a turn squared.
 
     :param angle: in turns, (N,)
     :param positions: in loops, (N, axes)
-    :return: the best numbers of turns, at most 3 each way, and their R²
+    :return: the best numbers of turns, at most 3 in either direction, and their R²
     """
     best, best_score = [0] * positions.shape[1], -np.inf
     for counts in np.stack(np.meshgrid(*[np.arange(-3, 4)] * positions.shape[1]), axis=-1).reshape(-1, positions.shape[1]):
@@ -96,11 +96,11 @@ def linearity(angle: np.ndarray, positions: np.ndarray) -> tuple[list[int], floa
 
 def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n: int = 200) -> np.ndarray:
     """
-    From random places by random actions, ``STEPS_AHEAD`` steps in the latent space; then the place whose latent state is
-    the nearest.
+    Predict ``STEPS_AHEAD`` random actions from random positions in the latent space, and decode the result as the position
+    with the nearest latent state.
 
-    :param places: to choose from, (N, axes)
-    :return: its distance from where the ball is then, in widths of the ball, (n,)
+    :param places: positions to choose from, (N, axes)
+    :return: distance of the decoded position from the true one, in widths of the ball, (n,)
     """
     rng = np.random.default_rng(0)
     actions = rng.integers(0, 2 * world.dimensions, (n, STEPS_AHEAD))
@@ -117,7 +117,7 @@ def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n
 
 
 def measure(model: EqRQRDQN, world: SlidingBall, per_axis: int) -> dict[str, Any]:
-    """What was learned, in numbers. Angles of actions are in steps of the ball."""
+    """Metrics of what was learned. Angles of actions are in steps of the ball."""
     places = grid(world.dimensions, per_axis)
     states = encode(model, images(world, places))
     angles = turns(model, states)  # (N, K)
@@ -138,7 +138,7 @@ def measure(model: EqRQRDQN, world: SlidingBall, per_axis: int) -> dict[str, Any
 
 
 def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) -> None:
-    """Figure 3: each block moves the vector (1, 0); the eight red points are eight equal steps along an axis."""
+    """Figure 3: the image of the vector (1, 0) under each block; the eight red points are equal steps along an axis."""
     n_blocks, axes = model.policy.latent_model.n_blocks, world.dimensions
     figure, panels = plt.subplots(
         axes, n_blocks + 1, figsize=(3 * (n_blocks + 1), 3.2 * axes), squeeze=False, layout="constrained"
@@ -191,7 +191,7 @@ def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> 
 
 
 def is_found(result: dict[str, Any]) -> bool:
-    """The ball: one full turn, R² ≥ 0.99. The torus: each block one full turn of an axis of its own, whatever the R²."""
+    """The ball: one full turn, R² ≥ 0.99. The torus: each block makes one full turn per loop of its own axis, for any R²."""
     counts = np.abs(result["turns_per_loop"])
     if result["world"] == "ball":
         return bool(abs(result["winding"]) == 1 and min(result["circular_r2"]) >= 0.99)
@@ -200,7 +200,7 @@ def is_found(result: dict[str, Any]) -> bool:
 
 def table(results: list[dict[str, Any]]) -> str:
     """
-    :return: Markdown, a row per world and arm; the worst of the seeds in every column
+    :return: a Markdown table, a row per world and arm; every column has the worst of the seeds
     """
     rows = ["| world | arm | steps | found | circular R² | not opposite | 20 steps ahead: mean | furthest |", "|---" * 8 + "|"]
     for key in dict.fromkeys((result["world"], result["arm"], result["steps"]) for result in results):
@@ -214,17 +214,17 @@ def table(results: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run what is not in results.jsonl yet, then tabulate all of it."""
+    """Run what is not yet in results.jsonl, then print the table of all runs."""
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--world", choices=DIMENSIONS, default="ball", help="a loop or a torus")
-    parser.add_argument("--arms", nargs="+", default=[DEFAULT_ARM], choices=[*ARMS, "each"], help="what is trained")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of everything random")
-    parser.add_argument("--steps", type=int, default=5_500, help="of random play; one update for each after the first 3000")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="folder")
+    parser.add_argument("--arms", nargs="+", default=[DEFAULT_ARM], choices=[*ARMS, "each"], help="settings to train with")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of all random generators")
+    parser.add_argument("--steps", type=int, default=5_500, help="steps of random actions; from 3000 on, an update for each")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="output folder")
     args = parser.parse_args()
-    th.set_num_threads(1)  # small networks are slower on two
+    th.set_num_threads(1)  # small networks are slower with two
     register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"

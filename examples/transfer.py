@@ -1,11 +1,10 @@
 """
-Does a representation help another task? A ball on a torus, two goals: the dynamics are the same, the rewards are not.
+Does a representation help with another task? A ball on a torus with two goals: the dynamics are the same, the rewards differ.
 
-    python examples/transfer.py --seeds 0 1 2 3 4      # the table of docs/transfer.md: an hour on one thread
+    python examples/transfer.py --seeds 0 1 2 3 4      # the table of docs/transfer.md, an hour on one thread
 
-Per seed, an agent learns goal A; agents for goal B start from scratch, from A's representation (frozen, too), and
-from one that was learned without any goal. Writes models, evaluations and results.jsonl to --out; finished runs are not
-repeated.
+For each seed, an agent learns goal A; agents for goal B start from scratch, from A's representation (also frozen), and from
+one that was learned without a goal. Writes models, evaluations and results.jsonl to --out; finished runs are not repeated.
 """
 
 import argparse
@@ -24,7 +23,7 @@ from sb3_eqr.envs import register
 from sb3_eqr.representation import train_representation
 
 GOALS = {"A": [0.25, 0.25], "B": [0.75, 0.5]}
-N_STEPS = 8  # around the torus, each way: 64 places
+N_STEPS = 8  # around the torus, along each axis: 64 positions
 STATES: dict[str, Any] = {"group": "SO(2)", "n_blocks": 2, "parameterization": "gram-schmidt", "whiten": True}
 STATES["state_dependent_actions"] = False
 ARMS = ("scratch", "transferred", "transferred, frozen", "without a goal, frozen")
@@ -32,13 +31,13 @@ EVAL_EPISODES = 25
 
 
 def make_env(goal: str | None, n_envs: int, seed: int) -> Any:
-    """A torus with a goal, episodes of at most 50 steps; a shortest way takes 4 on average, at most 8."""
+    """A torus with a goal and episodes of at most 50 steps; a shortest path has 4 steps on average, at most 8."""
     kwargs = {"n_steps": N_STEPS, "goal": None if goal is None else GOALS[goal], "max_episode_steps": 50}
     return VecTransposeImage(make_vec_env("SlidingBallTorus-v0", n_envs, seed, env_kwargs=kwargs))
 
 
 def make_agent(goal: str, seed: int, frozen: bool) -> EqRQRDQN:
-    """Same settings for every arm; frozen representations need no transition losses."""
+    """The same settings for every arm; frozen representations need no transition losses."""
     return EqRQRDQN(
         "CnnPolicy",
         make_env(goal, 1, seed),
@@ -57,7 +56,7 @@ def make_agent(goal: str, seed: int, frozen: bool) -> EqRQRDQN:
 
 
 def run(goal: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[str, Any]:
-    """Train one agent; its evaluations along the way."""
+    """Train one agent and return its evaluations during training."""
     frozen = arm.endswith("frozen")
     model = make_agent(goal, seed, frozen)
     if arm.startswith("transferred"):
@@ -95,7 +94,7 @@ def run(goal: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[s
 
 def table(results: list[dict[str, Any]]) -> str:
     """
-    :return: Markdown: per arm, mean and standard deviation over seeds; the last column is paired by seed
+    :return: a Markdown table with mean and standard deviation over seeds per arm; the last column is paired by seed
     """
     rows = ["| goal | start | seeds | mean of all evaluations | last three | more than from scratch |", "|---" * 6 + "|"]
     areas = {(run["goal"], run["arm"], run["seed"]): run["area"] for run in results}
@@ -111,15 +110,15 @@ def table(results: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Goal A from scratch, then goal B in every arm."""
+    """Train goal A from scratch, then goal B in every arm."""
     parser = argparse.ArgumentParser(
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of everything random")
-    parser.add_argument("--steps", type=int, default=3_000, help="of each agent")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/transfer"), help="folder")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of all random generators")
+    parser.add_argument("--steps", type=int, default=3_000, help="training steps of each agent")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/transfer"), help="output folder")
     args = parser.parse_args()
-    th.set_num_threads(1)  # small networks are slower on two
+    th.set_num_threads(1)  # small networks are slower with two
     register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"

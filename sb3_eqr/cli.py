@@ -3,21 +3,21 @@
 import importlib
 import sys
 
-# Commands of this package, and RL Zoo's; each is also the extra that it needs.
+# Commands of this package rather than RL Zoo; each has the name of the extra that it needs.
 COMMANDS = ("benchmark", "visualize")
 
 
 def main() -> None:
-    """Run the command line, or tell what to install for it."""
+    """Run the command, or print what to install for it."""
     extra = sys.argv[1] if sys.argv[1:2] and sys.argv[1] in COMMANDS else "zoo"
     try:
         if extra in COMMANDS:
             del sys.argv[1]
         run = importlib.import_module(f"sb3_eqr.{extra}.__main__").main
     except ImportError as error:
-        advice = "" if "pip install" in str(error) else f'. pip install ".[{extra}]" in a clone of the repository brings it'
+        advice = "" if "pip install" in str(error) else f'. Run pip install ".[{extra}]" in a clone of the repository'
         others = (
-            "" if extra in COMMANDS else ". Without it there are: " + ", ".join(f"sb3-eqr {name} --help" for name in COMMANDS)
+            "" if extra in COMMANDS else ". Available without it: " + ", ".join(f"sb3-eqr {name} --help" for name in COMMANDS)
         )
         sys.exit(f"sb3-eqr: {error}{advice}{others}")
     run()

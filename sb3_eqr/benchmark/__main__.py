@@ -51,7 +51,7 @@ def main() -> None:
     try:
         execute = importlib.import_module("sb3_eqr.benchmark.commands").execute
     except ImportError as error:
-        sys.exit(f'sb3-eqr benchmark: {error}. pip install ".[benchmark]" in a clone of the repository')
+        sys.exit(f'sb3-eqr benchmark: {error}. Run pip install ".[benchmark]" in a clone of the repository')
     execute(args)
 
 

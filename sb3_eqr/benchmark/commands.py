@@ -1,4 +1,4 @@
-"""What ``sb3-eqr benchmark run|status|report`` do, with what they import: the command line prints its help without it."""
+"""The commands ``sb3-eqr benchmark run|status|report``, apart from the parser, whose help needs none of these imports."""
 
 import argparse
 import pathlib
@@ -109,7 +109,7 @@ def report(args: argparse.Namespace) -> int:
 
 
 def execute(args: argparse.Namespace) -> None:
-    """Run a command and exit with its status, or with a message and status 2 where the user has to do something."""
+    """Run a command and exit with its status, or with a message and status 2 if the user has to do something."""
     try:
         sys.exit({"run": run, "status": status, "report": report}[args.command](args))
     except (ValueError, ImportError, ConnectionError, OSError) as error:

@@ -92,7 +92,7 @@ def _start_ray(address: str | None) -> Any:
     try:
         import ray
     except ImportError as error:
-        raise ImportError('benchmark run needs Ray: pip install ".[benchmark]" in a clone of the repository') from error
+        raise ImportError('Ray is not installed. Run pip install ".[benchmark]" in a clone of the repository') from error
     host, _, port = (address or "").rpartition(":")
     if host and port.isdigit() and "/" not in host:  # else "auto", or another of Ray's forms
         try:

@@ -18,38 +18,38 @@ from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictur
 from sb3_eqr.visualize.tables import all_tables, write_tables
 from sb3_eqr.visualize.tables import factor_names as all_names
 
-DEPTH = 5  # where the agent has no latent losses
-FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # what an argument of play is called here
+DEPTH = 5  # for agents without latent losses
+FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # argument of play -> flag
 
 
 def make_parser() -> argparse.ArgumentParser:
     """
-    :return: of the command
+    :return: the parser of the command
     """
-    parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="What an agent's latent model has learned.")
-    parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file that an agent's save wrote")
-    parser.add_argument("--env", help="of gymnasium (default: what RL Zoo wrote beside MODEL)")
-    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="of the environment's constructor")
-    parser.add_argument("--algo", choices=list(AGENTS), help="(default: found out from MODEL)")
-    parser.add_argument("--steps", type=int, default=1000, help="of play, over all environments (default: 1000)")
-    parser.add_argument("--depth", type=int, help=f"how many steps to predict (default: the agent's, {DEPTH} where it has 0)")
+    parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
+    parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file written by an agent's save")
+    parser.add_argument("--env", help="gymnasium id (default: from RL Zoo's files next to MODEL)")
+    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="arguments of the environment")
+    parser.add_argument("--algo", choices=list(AGENTS), help="default: detected from MODEL")
+    parser.add_argument("--steps", type=int, default=1000, help="steps to run, over all environments (default: 1000)")
+    parser.add_argument("--depth", type=int, help=f"number of steps to predict (default: the agent's, or {DEPTH} if it has 0)")
     parser.add_argument("--n-envs", type=int, default=1, help="number of environments (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of the environment and of the agent's noise (default: 0)")
-    parser.add_argument("--device", default="auto", help="of PyTorch (default: auto)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the environment and the agent's noise (default: 0)")
+    parser.add_argument("--device", default="auto", help="PyTorch device (default: auto)")
     parser.add_argument("--deterministic", action="store_true", help="let the agent act without noise")
     parser.add_argument("--video", action="store_true", help="also write play.mp4 and play.gif")
-    parser.add_argument("--trust", action="store_true", help="let MODEL, and what RL Zoo wrote beside it, name code that runs")
-    parser.add_argument("--out", type=pathlib.Path, metavar="FOLDER", help="(default: MODEL without .zip, and _diagnostics)")
+    parser.add_argument("--trust", action="store_true", help="let MODEL and RL Zoo's files next to it name code that runs")
+    parser.add_argument("--out", type=pathlib.Path, metavar="FOLDER", help="output folder (default: <MODEL>_diagnostics)")
     return parser
 
 
 def run(args: argparse.Namespace) -> None:
     """
-    :param args: of the command
-    :raises ValueError: for wrong use
+    :param args: arguments of the command
+    :raises ValueError: for invalid arguments
     """
     if args.n_envs < 1:
-        raise ValueError(f"--n-envs: expected at least 1, found {args.n_envs}")
+        raise ValueError(f"--n-envs must be >= 1, got {args.n_envs}.")
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
     env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust)
@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> None:
 
 def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dict[str, Figure]:
     """
-    :param factors: names of the true factors, where known
-    :return: coloured by time, or by the first factor; then one for each further factor
+    :param factors: names of the true factors, if known
+    :return: one figure coloured by time, or one per factor
     """
     states = encode(model, played.samples.observations)
     if played.factors is None:
@@ -91,21 +91,21 @@ def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dic
 
 def write_video(model: EqRAlgorithm, env: VecEnv, folder: pathlib.Path, depth: int, args: argparse.Namespace) -> None:
     """
-    :param folder: where play.mp4 and play.gif are written
+    :param folder: folder for play.mp4 and play.gif
     """
-    from sb3_eqr.visualize.animation import record  # its libraries are needed for this alone
+    from sb3_eqr.visualize.animation import record  # only videos need its libraries
 
     record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
 
 
 def fail(message: str) -> NoReturn:
-    """Tell what is wrong, without a traceback, and leave with status 2 as argparse does."""
+    """Print an error without a traceback, and exit with status 2 as argparse does."""
     print(f"sb3-eqr visualize: {message}", file=sys.stderr)
     raise SystemExit(2)
 
 
 def main() -> None:
-    """Parse the command line and do what it says."""
+    """Parse the command line and run the command."""
     args = make_parser().parse_args()
     try:
         run(args)

@@ -3,14 +3,14 @@ RL Zoo with the EqR agents: registration, search spaces, and the command line ``
 
     sb3-eqr train --algo eqr_rainbow --env CartPole-v1 --conf-file FILE_OR_NAME ...
 
-Every command is RL Zoo's own, with all of its flags; what is added is the agents ``eqr_qrdqn`` and ``eqr_rainbow``, their
-hyperparameter files, and messages instead of tracebacks for wrong use.
+Every command is RL Zoo's, with all of its flags. The package adds the agents ``eqr_qrdqn`` and ``eqr_rainbow``, their
+hyperparameter files, and error messages instead of tracebacks.
 """
 
 try:
     import rl_zoo3.import_envs  # noqa: F401
 except ImportError as error:
-    raise ImportError(f'sb3_eqr.zoo needs RL Zoo, found: {error}. pip install ".[zoo]" in a clone of the repository') from None
+    raise ImportError(f'sb3_eqr.zoo needs RL Zoo: {error}. Run pip install ".[zoo]" in a clone of the repository') from None
 
 from sb3_eqr import AGENTS
 from sb3_eqr.zoo.registration import register

@@ -1,4 +1,4 @@
-"""The command line: thin doors to RL Zoo's own functions."""
+"""The command line: thin wrappers of RL Zoo's functions."""
 
 import argparse
 import importlib
@@ -34,27 +34,27 @@ MODULES = {
 COMMANDS = [*FUNCTIONS, *MODULES]
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
 LOADING = ("enjoy", "record_video", "push_to_hub")
-DOWNLOADS = "rl-trained-agents"  # where enjoy looks, and puts what it downloads
+DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 
-# What the extra brings.
+# Packages of the extra "zoo".
 EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
 RESUMING = """train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's
-folder, and --resume FOLDER, which continues a run from its last one; --trust where its settings hold Python objects
+folder, and --resume FOLDER, which resumes a run from its last one; add --trust if its settings contain Python objects
 """
 USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
 
-Every command but the last two takes RL Zoo's arguments: sb3-eqr train --help
+All commands except the last two take RL Zoo's arguments: sb3-eqr train --help
 {RESUMING}benchmark compares agents over games and seeds: sb3-eqr benchmark --help
 visualize shows what a saved agent has learned: sb3-eqr visualize --help
-push_to_hub also takes --dry-run: build the folder hub/, upload nothing."""
+push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothing."""
 
 
 def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
     """
-    :param algo: as given to ``--algo``
-    :param conf_file: as given to ``--conf-file``: a path, or the name of one of our files
-    :return: the file to use; ``None``: RL Zoo's own
+    :param algo: value of ``--algo``
+    :param conf_file: value of ``--conf-file``: a path, or the name of one of our files
+    :return: the file to use; ``None``: RL Zoo's
     """
     files = configuration_files()
     if conf_file is None:
@@ -66,8 +66,8 @@ def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     """
-    :param arguments: of ``train`` or of a command that loads an agent
-    :return: what is looked at here; RL Zoo parses everything once more
+    :param arguments: arguments of ``train`` or of a command that loads an agent
+    :return: the arguments checked here; RL Zoo parses all arguments again
     """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
@@ -90,7 +90,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     try:
         return parser.parse_known_args(arguments)[0]
     except (NameError, SyntaxError) as error:
-        fail(f"--hyperparams: expected key:value, the value in Python ('text' in quotes), found one that is not: {error}")
+        fail(f"--hyperparams must be key:value with Python values (strings in quotes), got an invalid one: {error}")
 
 
 def add_resuming(parser: argparse.ArgumentParser) -> None:
@@ -102,10 +102,10 @@ def add_resuming(parser: argparse.ArgumentParser) -> None:
 
 def prepare_training(args: argparse.Namespace) -> str | None:
     """
-    Check everything before RL Zoo starts.
+    Check all arguments before RL Zoo starts.
 
-    :param args: of ``train``
-    :return: the file of hyperparameters to use; ``None``: RL Zoo's own
+    :param args: arguments of ``train``
+    :return: the file of hyperparameters to use; ``None``: RL Zoo's
     """
     algo = args.algo or "ppo"
     path = find_hyperparameters(algo, args.conf_file)
@@ -119,7 +119,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
     name = entry_name(read_file(path), args.env)
-    if name.startswith("default-"):  # RL Zoo would take "default"
+    if name.startswith("default-"):  # RL Zoo would use "default"
         file = pathlib.Path(tempfile.mkdtemp()) / f"{args.algo}.yml"
         file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
         print(f"Using the entry {name!r} of {path}")
@@ -128,28 +128,26 @@ def prepare_training(args: argparse.Namespace) -> str | None:
 
 
 def without_resuming(arguments: list[str]) -> list[str]:
-    """What is left of a command line for RL Zoo's own parser."""
+    """:return: the arguments for RL Zoo's parser"""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     add_resuming(parser)
     return parser.parse_known_args(arguments)[1]
 
 
 def prepare_resuming(args: argparse.Namespace) -> None:
-    """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and let RL Zoo do as they say."""
+    """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and make RL Zoo apply them."""
     from sb3_eqr.zoo import resuming
 
     is_asked = args.checkpoint_every is not None or args.resume is not None
     if is_asked and args.algo not in AGENTS:
-        fail(f"--checkpoint-every and --resume: expected --algo {' or '.join(AGENTS)}, found {args.algo}.")
+        fail(f"--algo must be {' or '.join(AGENTS)} with --checkpoint-every or --resume, got {args.algo}.")
     if args.checkpoint_every is not None and args.checkpoint_every < 1:
-        fail(f"--checkpoint-every: expected at least 1 step, found {args.checkpoint_every}.")
+        fail(f"--checkpoint-every must be >= 1 step, got {args.checkpoint_every}.")
     if args.optimize_hyperparameters and is_asked:
-        fail("--checkpoint-every and --resume: expected one run, found a search (-optimize).")
+        fail("--checkpoint-every and --resume are for single runs, got a search (-optimize).")
     if args.resume is not None:
         if args.hyperparams or args.trained_agent or args.seed != -1:
-            fail(
-                "--resume continues a run with its own settings and seed: leave out --hyperparams, --trained-agent and --seed."
-            )
+            fail("--resume uses the settings and seed of the run: leave out --hyperparams, --trained-agent and --seed.")
         try:
             read_manifest(resuming.checkpoints_of(args.resume))
         except ValueError as error:
@@ -158,18 +156,18 @@ def prepare_resuming(args: argparse.Namespace) -> None:
 
 
 def check_runs(arguments: list[str]) -> None:
-    """Leave with a message if ``all_plots`` would draw nothing."""
+    """Exit with a message if ``all_plots`` would draw nothing."""
     parser = argparse.ArgumentParser(add_help=False)
     for flags in (("-a", "--algos"), ("-e", "--env"), ("-f", "--exp-folders")):
         parser.add_argument(*flags, nargs="+", default=[])
     args = parser.parse_known_args(arguments)[0]
     places = [pathlib.Path(folder) / algo for folder in args.exp_folders for algo in args.algos]
     if args.env and places and not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
-        fail(f"all_plots: expected runs on {', '.join(args.env)} in {', '.join(map(str, places))}, found none.")
+        fail(f"all_plots needs runs on {', '.join(args.env)} in {', '.join(map(str, places))}, got none.")
 
 
 def check_trained(args: argparse.Namespace) -> None:
-    """Leave with a message if the trained agent is not where it is looked for."""
+    """Exit with a message if there is no trained agent at the given place."""
     try:
         get_model_path(
             args.exp_id,
@@ -188,7 +186,7 @@ def check_trained(args: argparse.Namespace) -> None:
 
 
 def save_where_nothing_is_shown(command: str) -> None:
-    """Without a display matplotlib shows nothing: write the figures into files instead."""
+    """Without a display, write matplotlib's figures to files instead of showing them."""
     import matplotlib.pyplot as plt
 
     def save(*_: object, **__: object) -> None:
@@ -204,7 +202,7 @@ def save_where_nothing_is_shown(command: str) -> None:
 def run(command: str, arguments: list[str]) -> None:
     """
     :param command: one of ``COMMANDS``
-    :param arguments: RL Zoo's own, on its command line
+    :param arguments: RL Zoo's command-line arguments
     """
     sys.argv = [f"sb3-eqr {command}", *arguments]
     try:
@@ -216,9 +214,7 @@ def run(command: str, arguments: list[str]) -> None:
             module, function = FUNCTIONS[command].split(":")
             getattr(importlib.import_module(module), function)()
     except ModuleNotFoundError as error:
-        advice = (
-            ' pip install ".[zoo]" in a clone of the repository brings it.' if str(error.name).split(".")[0] in EXTRA else ""
-        )
+        advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         fail(f"{command}: {error}.{advice}")
     except gym.error.DependencyNotInstalled as error:
         fail(str(error))
@@ -234,12 +230,12 @@ def run(command: str, arguments: list[str]) -> None:
         if command in PLOTS:
             fail(f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each.")
         if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):
-            fail(f"{error} So: TRUST_REMOTE_CODE=True sb3-eqr load_from_hub ...")
+            fail(f"{error} Run TRUST_REMOTE_CODE=True sb3-eqr load_from_hub ...")
         raise
 
 
 def prepare(command: str, arguments: list[str]) -> list[str]:
-    """Check what a command is asked, before RL Zoo starts; returns what is left for RL Zoo."""
+    """Check a command's arguments before RL Zoo starts; returns those for RL Zoo."""
     if command == "all_plots":
         check_runs(arguments)
     if command in PLOTS:
@@ -268,7 +264,7 @@ def main() -> None:
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in COMMANDS:
         fail(
-            f"expected one of {', '.join(COMMANDS)}, benchmark, visualize, found {command!r}."
+            f"The command must be one of {', '.join(COMMANDS)}, benchmark, visualize, got {command!r}."
             f"{nearest(command, [*COMMANDS, 'benchmark', 'visualize'])}"
         )
     register()

@@ -1,4 +1,4 @@
-"""Wrong use of the command line, told before RL Zoo starts: what was expected, what was found, what to do."""
+"""Checks of the command line before RL Zoo starts, with messages that say what to do."""
 
 import difflib
 import importlib
@@ -12,7 +12,7 @@ import gymnasium as gym
 import torch as th
 from rl_zoo3.utils import ALGOS
 
-# The start of an environment's name, and what it needs.
+# Prefix of an environment's name -> package that it needs, and how to install it.
 EXTRAS = {
     "ALE/": ("ale_py", '".[atari]" in a clone of the repository'),
     "MinAtar/": ("minatar", "minatar"),
@@ -21,54 +21,54 @@ EXTRAS = {
 
 def nearest(name: str, legal: Iterable[str]) -> str:
     """
-    :return: a question for the end of a message: the closest legal name, or nothing
+    :return: the end of a message: a question with the closest legal name, or ""
     """
     found = difflib.get_close_matches(name, list(legal), n=1)
     return f" Did you mean {found[0]!r}?" if found else ""
 
 
 def fail(message: str) -> NoReturn:
-    """Tell what is wrong, without a traceback, and leave with status 2 as argparse does."""
+    """Print an error without a traceback, and exit with status 2 as argparse does."""
     print(f"sb3-eqr: {message}", file=sys.stderr)
     raise SystemExit(2)
 
 
 def check_algo(algo: str) -> None:
-    """Leave with a message if there is no such algorithm."""
+    """Exit with a message if the algorithm is unknown."""
     if algo not in ALGOS:
-        fail(f"--algo: expected one of {', '.join(ALGOS)}, found {algo!r}.{nearest(algo, ALGOS)}")
+        fail(f"--algo must be one of {', '.join(ALGOS)}, got {algo!r}.{nearest(algo, ALGOS)}")
 
 
 def check_environment(env_id: str, packages: list[str]) -> None:
-    """Leave with a message if gymnasium does not know the environment once these packages are imported."""
+    """Exit with a message if the environment is not registered after these packages are imported."""
     for package in packages:
         try:
             importlib.import_module(package)
         except ImportError as error:
-            fail(f"--gym-packages: {package!r} cannot be imported ({error}). Install it, or correct its name.")
+            fail(f"--gym-packages: {package!r} cannot be imported ({error}). Install it, or correct the name.")
     for start, (package, requirement) in EXTRAS.items():
         is_meant = env_id.startswith(start) or (start == "ALE/" and "NoFrameskip" in env_id)
         if is_meant and importlib.util.find_spec(package) is None:
-            fail(f"--env: {env_id} needs {package}: pip install {requirement}")
+            fail(f"--env: {env_id} needs {package}. Run pip install {requirement}.")
     if env_id not in gym.registry:
         fail(f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry)}")
 
 
 def check_machine(device: str, track: bool, tensorboard_log: str) -> None:
-    """Leave with a message if a GPU is asked for and not there, or Weights & Biases, or TensorBoard."""
+    """Exit with a message if a requested GPU, Weights & Biases or TensorBoard is not available."""
     try:
         th.device("cpu" if device == "auto" else device)
     except RuntimeError:
-        fail(f"--device: expected auto, cpu, cuda or another device of PyTorch, found {device!r}.")
+        fail(f"--device must be auto, cpu, cuda or another PyTorch device, got {device!r}.")
     if device.startswith("cuda") and not th.cuda.is_available():
-        fail(f"--device: {device} was asked for, but PyTorch finds no GPU. Pass --device cpu, or leave it out.")
+        fail(f"--device is {device}, but PyTorch finds no GPU. Pass --device cpu, or leave it out.")
     if track and importlib.util.find_spec("wandb") is None:
-        fail("--track: Weights & Biases is not installed: pip install wandb")
+        fail("--track needs Weights & Biases. Run pip install wandb.")
     if (track or tensorboard_log) and importlib.util.find_spec("tensorboard") is None:
-        fail(f"{'--track' if track else '--tensorboard-log'}: TensorBoard is not installed: pip install tensorboard")
+        fail(f"{'--track' if track else '--tensorboard-log'} needs TensorBoard. Run pip install tensorboard.")
 
 
 def check_trained_agent(path: str) -> None:
-    """Leave with a message if there is nothing to continue from."""
+    """Exit with a message if the trained agent to continue from does not exist."""
     if path and not (path.endswith(".zip") and pathlib.Path(path).is_file()):
-        fail(f"--trained-agent: expected the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, found {path!r}.")
+        fail(f"--trained-agent must be the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, got {path!r}.")

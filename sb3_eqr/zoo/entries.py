@@ -1,4 +1,4 @@
-"""Entries of hyperparameter files, read as RL Zoo reads them, and what can be wrong with them."""
+"""Read entries of hyperparameter files as RL Zoo does, and check them."""
 
 import importlib
 import importlib.util
@@ -18,9 +18,9 @@ from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.zoo.checks import fail, nearest
 
-# What RL Zoo takes out of an entry before it calls the constructor.
+# Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
-# What it passes to the constructor itself.
+# Arguments that RL Zoo itself passes to the constructor, and their flags.
 FLAGS = {
     "env": "--env",
     "seed": "--seed",
@@ -32,7 +32,7 @@ FLAGS = {
 
 
 def is_schedule(value: Any) -> bool:
-    """Whether RL Zoo makes a schedule of it: "lin_1e-3" falls to 0."""
+    """Whether RL Zoo converts the value to a schedule: "lin_1e-3" decreases linearly to 0."""
     try:
         return isinstance(value, str) and value.startswith("lin_") and float(value.removeprefix("lin_")) >= 0
     except ValueError:
@@ -40,7 +40,7 @@ def is_schedule(value: Any) -> bool:
 
 
 SMALLEST_IMAGE = 36  # pixels: what the convolutions of the "default-image" entries need
-# What it reads itself.
+# Values that RL Zoo itself reads.
 RULES = {
     "n_timesteps": number(0, above=True),
     "n_envs": integer(1),
@@ -52,12 +52,13 @@ RULES = {
 
 def read_file(path: str) -> dict[str, Any]:
     """
-    :param path: a YAML file, a Python file or a Python package, the last two with a dictionary ``hyperparams``
-    :return: its entries; leaves with a message if it cannot be read
+    :param path: a YAML file, or a Python file or package with a dictionary ``hyperparams``
+    :return: its entries; exits with a message if it cannot be read
     """
     if not path.endswith((".yml", ".yaml", ".py")):
         if importlib.util.find_spec(path.split(".")[0]) is None:
-            fail(f"--conf-file: {path!r} is no file, no Python package, and none of {', '.join(configuration_files())}.")
+            names = ", ".join(configuration_files())
+            fail(f"--conf-file must be a YAML file, a Python file or package, or one of {names}, got {path!r}.")
         return importlib.import_module(path).hyperparams
     file = pathlib.Path(path)
     if not file.is_file():
@@ -69,18 +70,18 @@ def read_file(path: str) -> dict[str, Any]:
     try:
         entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
     except yaml.YAMLError as error:
-        fail(f"{path} is no YAML: {error}")
+        fail(f"{path} must be valid YAML: {error}")
     if not isinstance(entries, dict):
-        fail(f"{path}: expected entries by the names of environments, found {entries!r:.60}.")
+        fail(f"{path} must be a mapping from environments to entries, got {entries!r:.60}.")
     return entries
 
 
 def entry_name(entries: dict[str, Any], env_id: str) -> str:
     """
-    :param entries: of a file
+    :param entries: entries of a file
     :param env_id: the environment
-    :return: its own name, "atari", or that of a generic entry: "default", or "default-image" and "default-small-image" where
-        the file has them and the observations are images (RL Zoo knows "default" alone)
+    :return: its own name, "atari", or that of a generic entry: "default", or "default-image" or "default-small-image" if
+        the file has them and the observations are images (RL Zoo itself knows only "default")
     """
     if env_id in entries:
         return env_id
@@ -98,17 +99,17 @@ def entry_name(entries: dict[str, Any], env_id: str) -> str:
 
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
     """
-    :param path: of the file
+    :param path: path of the file
     :param env_id: the environment
-    :param changes: of the command line
-    :return: the entry with the changes, as it is written; leaves with a message if there is none
+    :param changes: changes from the command line
+    :return: the entry as in the file, with the changes; exits with a message if there is none
     """
     entries = read_file(path)
     name = entry_name(entries, env_id)
     if name not in entries:
-        fail(f"{path}: no entry for {env_id!r}; it has {', '.join(entries) or 'none'}. Add one, or use another file.")
+        fail(f"{path} has no entry for {env_id!r}, only for {', '.join(entries) or 'none'}. Add one, or use another file.")
     if not isinstance(entries[name] or {}, dict):
-        fail(f"{path}: {name}: expected hyperparameters by name, found {entries[name]!r:.60}.")
+        fail(f"{path}: {name} must be a mapping of hyperparameters, got {entries[name]!r:.60}.")
     entry = {**(entries[name] or {}), **changes}
     for key in ("policy", "n_timesteps"):
         if key not in entry:
@@ -129,19 +130,19 @@ def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
 
 def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     """
-    Leave with a message if there is a key that no constructor takes, or wrappers that our agents cannot use.
+    Exit with a message if a key is not an argument of the constructor, or a wrapper does not work with our agents.
 
     :param entry: hyperparameters for one environment
-    :param algo: the algorithm that they are for
-    :param source: where they stand
+    :param algo: the algorithm
+    :param source: where the hyperparameters are from, for messages
     """
     algorithm = ALGOS[algo]
     legal = ENTRY_KEYS | set(inspect.signature(algorithm).parameters) - FLAGS.keys()
     for key in entry:
         if key in FLAGS:
-            fail(f"{source}: {key!r} cannot stand there: RL Zoo sets it by {FLAGS[key]}.")
+            fail(f"{source}: {key!r} is not allowed here, because RL Zoo sets it from {FLAGS[key]}.")
         if key not in legal:
-            fail(f"{source}: {key!r} is no argument of {algorithm.__name__}.{nearest(key, legal)}")
+            fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}.{nearest(key, legal)}")
     for key, rule in RULES.items():
         if key in entry and not rule.holds(entry[key]):
             fail(f"{source}: {key} must be {rule.says}, got {entry[key]!r}.")
@@ -152,16 +153,16 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
         own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
         for key in policy_kwargs:
             if key not in own:
-                fail(f"{source}: {key!r} is no policy_kwargs of {algorithm.__name__}.{nearest(key, own)}")
+                fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}'s policy.{nearest(key, own)}")
     if issubclass(algorithm, EqRAlgorithm):
         check_wrappers(entry, algorithm.__name__, source)
 
 
 def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:
-    """Leave with a message if RL Zoo would wrap the environment in a way that our agents cannot use."""
+    """Exit with a message if RL Zoo would wrap the environment in a way that does not work with our agents."""
     if "HistoryWrapper" in str(entry.get("env_wrapper")):
         fail(
-            f"{source}: RL Zoo's HistoryWrapper takes continuous actions, {name} has discrete ones. "
+            f"{source}: RL Zoo's HistoryWrapper needs continuous actions, but {name} supports discrete ones. "
             "Use frame_stack: 4 instead."
         )
     if entry.get("normalize") and entry.get("frame_stack"):

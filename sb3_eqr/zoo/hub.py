@@ -1,4 +1,4 @@
-"""What the Hugging Face Hub needs beside RL Zoo: a look before the upload, and a model card that names our commands."""
+"""Additions to RL Zoo for the Hugging Face Hub: a dry run, and a model card with our commands."""
 
 import importlib
 import os
@@ -20,13 +20,13 @@ REPLACED = {
 
 def correct_card(text: str) -> str:
     """
-    :param text: a model card of RL Zoo's
-    :return: the same with commands that know our agents
+    :param text: a model card by RL Zoo
+    :return: the card with commands that know our agents
     """
     for old, new in REPLACED.items():
         text = text.replace(old, new)
-    text = text.replace("\nsb3-eqr load_from_hub", "\nTRUST_REMOTE_CODE=True sb3-eqr load_from_hub")  # it unpickles
-    second = text.find("If you installed the RL Zoo3 via pip")  # the same commands once more
+    text = text.replace("\nsb3-eqr load_from_hub", "\nTRUST_REMOTE_CODE=True sb3-eqr load_from_hub")  # it unpickles the model
+    second = text.find("If you installed the RL Zoo3 via pip")  # repeats the commands
     end = text.find("## Training", second)
     return text if second < 0 else text[:second] + text[end:]
 
@@ -35,7 +35,7 @@ class CheckedHub(huggingface_hub.HfApi):
     """Corrects the model card before the upload."""
 
     def upload_folder(self, *, folder_path: str | pathlib.Path, **kwargs: Any) -> Any:  # type: ignore[override]
-        """As that of ``HfApi``."""
+        """Correct the card, then upload as ``HfApi`` does."""
         card = pathlib.Path(folder_path) / "README.md"
         card.write_text(correct_card(card.read_text(encoding="utf-8")), encoding="utf-8")
         return self._send(folder_path, kwargs)
@@ -45,30 +45,30 @@ class CheckedHub(huggingface_hub.HfApi):
 
 
 class DryHub(CheckedHub):
-    """Builds everything in the folder and sends nothing."""
+    """Builds everything in the folder and uploads nothing."""
 
     def create_repo(self, repo_id: str, **kwargs: Any) -> str:  # type: ignore[override]
         """
-        :return: what stands for the address
+        :return: a placeholder for the address
         """
         return f"{repo_id} (not uploaded)"
 
     def snapshot_download(self, repo_id: str, *, local_dir: str | pathlib.Path, **kwargs: Any) -> str:  # type: ignore[override]
         """
-        :return: the folder, made
+        :return: the folder, which is created
         """
         pathlib.Path(local_dir).mkdir(parents=True, exist_ok=True)
         return str(local_dir)
 
     def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> NoReturn:
         print(f"--dry-run: built in {folder_path}, nothing was uploaded.")
-        raise SystemExit(0)  # before RL Zoo tells of a success
+        raise SystemExit(0)  # before RL Zoo reports a successful upload
 
 
 def generate_metadata(*args: Any) -> dict[str, Any]:
     """
-    The head of a model card: huggingface_sb3's, under the name and in the form that RL Zoo asks for. Not needed any more once
-    https://github.com/huggingface/huggingface_sb3/issues/54 is solved.
+    The metadata of a model card: huggingface_sb3's, under the name and in the form that RL Zoo expects. Can be removed once
+    https://github.com/huggingface/huggingface_sb3/issues/54 is fixed.
     """
     found = importlib.import_module("huggingface_sb3.push_to_hub")._generate_metadata(*args).to_dict()
     return found | {"tags": [*found["tags"], "sb3-eqr"]}
@@ -76,11 +76,11 @@ def generate_metadata(*args: Any) -> dict[str, Any]:
 
 def load_from_hub(repo_id: str, filename: str) -> str:
     """
-    :param repo_id: of the repository
-    :param filename: in it
-    :return: where the file is after the download
-    :raises requests.HTTPError: if there is no such file: what RL Zoo 2.9 expects where normalisation is not used, and current
-        versions of huggingface_hub do not raise (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252)
+    :param repo_id: id of the repository
+    :param filename: name of the file in it
+    :return: path of the downloaded file
+    :raises requests.HTTPError: if there is no such file; RL Zoo 2.9 expects it for models without normalisation, but current
+        versions of huggingface_hub raise another error (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252)
     """
     try:
         return DOWNLOAD(repo_id, filename)
@@ -90,9 +90,9 @@ def load_from_hub(repo_id: str, filename: str) -> str:
 
 def prepare(dry_run: bool) -> None:
     """
-    Set the stage for RL Zoo's ``push_to_hub`` and ``load_from_hub``.
+    Patch what RL Zoo's ``push_to_hub`` and ``load_from_hub`` use.
 
-    :param dry_run: whether to build the folder only
+    :param dry_run: whether to only build the folder
     """
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
     importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
@@ -101,7 +101,7 @@ def prepare(dry_run: bool) -> None:
 
 
 def provide_ffmpeg() -> None:
-    """Where there is no ``ffmpeg`` command, which the video needs, put that of moviepy in the path."""
+    """If there is no ``ffmpeg`` command, which the video needs, add moviepy's to the path."""
     if shutil.which("ffmpeg") is None:
         import imageio_ffmpeg
 

@@ -1,4 +1,4 @@
-"""The agents in RL Zoo's tables."""
+"""Register the agents with RL Zoo."""
 
 from functools import partial
 from typing import Any
@@ -12,9 +12,9 @@ from sb3_eqr.zoo.search import convert_eqr_params, make_sampler
 
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     """
-    Put the agents into RL Zoo's tables, with their search spaces, and the package's environments into gymnasium's.
+    Register the agents and their search spaces with RL Zoo, and the package's environments with gymnasium.
 
-    :param policy_kwargs: those that a search keeps as they are
+    :param policy_kwargs: ``policy_kwargs`` that a search does not change
     """
     ALGOS.update(AGENTS)  # type: ignore[arg-type]
     kept = policy_kwargs or {}

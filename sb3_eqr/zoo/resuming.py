@@ -1,4 +1,4 @@
-"""Runs of ``sb3-eqr train`` that can be stopped: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
+"""Resumable runs of ``sb3-eqr train``: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
 
 import pathlib
 from functools import partial
@@ -18,7 +18,7 @@ FOLDER = "checkpoints"  # in the folder of a run
 
 
 class ResumableExperiment(ExperimentManager):
-    """RL Zoo's experiment, which writes checkpoints or continues from one, in a folder of its own as with ``-i``."""
+    """RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``."""
 
     checkpoint_every: ClassVar[int | None] = None
     resume: ClassVar[pathlib.Path | None] = None
@@ -29,14 +29,14 @@ class ResumableExperiment(ExperimentManager):
         self.continue_training = self.continue_training or self.resume is not None
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """RL Zoo's; what cannot be built gets a message instead of a traceback."""
+        """As RL Zoo's; exits with a message instead of a traceback if the experiment cannot be built."""
         try:
             return super().setup_experiment()
         except (ValueError, TypeError, IndexError, ImportError) as error:
             fail(f"{self.algo} on {self.env_name.gym_id}, by {self.config}: {error}")
 
     def create_callbacks(self) -> None:
-        """RL Zoo's, and one for the checkpoints."""
+        """RL Zoo's callbacks, and one for the checkpoints."""
         super().create_callbacks()
         if self.checkpoint_every is not None:
             folder = pathlib.Path(self.save_path) / FOLDER
@@ -47,13 +47,15 @@ class ResumableExperiment(ExperimentManager):
             return super()._load_pretrained_agent(hyperparams, env)
         model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
         if self.n_timesteps <= model.num_timesteps:
-            fail(f"--resume: {self.resume} is at step {model.num_timesteps} already, of {self.n_timesteps}. Pass a larger -n.")
+            fail(
+                f"--resume: {self.resume} is already at step {model.num_timesteps}, and -n is {self.n_timesteps}. Pass a larger -n."
+            )
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         return model
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """RL Zoo's, which counts steps from 0; a resumed run counts on."""
+        """As RL Zoo's, which counts steps from 0, but a resumed run keeps its count."""
         if self.resume is None:
             super().learn(model)
         else:
@@ -62,16 +64,16 @@ class ResumableExperiment(ExperimentManager):
 
 
 def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
-    """The checkpoints of a run's folder; any other path is one of checkpoints."""
+    """The folder of checkpoints in a run's folder; any other path is returned unchanged."""
     return path / FOLDER if (path / FOLDER).is_dir() else path
 
 
 def install(checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool) -> None:
     """
-    Let ``rl_zoo3.train`` make such experiments. Its parser knows no other arguments than its own, hence the attributes.
+    Make ``rl_zoo3.train`` use this experiment. Options are class attributes, because its parser knows only its own arguments.
 
-    :param checkpoint_every: steps between two checkpoints; ``None``: none are written
-    :param resume: a run's folder, or one of checkpoints
+    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
+    :param resume: a run's folder, or a folder of checkpoints
     :param trust: as in ``load``
     """
     ResumableExperiment.checkpoint_every = checkpoint_every

@@ -1,4 +1,4 @@
-"""What ``-optimize`` searches over."""
+"""The search space of ``-optimize``."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,8 +8,8 @@ NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 
 def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
     """
-    :param sampled: values of the search, by the names of :func:`make_sampler`
-    :param kept: ``policy_kwargs`` that are not searched; RL Zoo would drop them
+    :param sampled: sampled values, with the names of :func:`make_sampler`
+    :param kept: ``policy_kwargs`` that are not searched, which RL Zoo would drop
     :return: keyword arguments of the agent
     """
     params = dict(sampled)
@@ -36,7 +36,7 @@ def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[st
 
 def make_sampler(categorical: bool, kept: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """
-    :param categorical: whether the range of returns is searched, too
+    :param categorical: whether to search the range of returns as well
     :param kept: ``policy_kwargs`` that are not searched
     :return: a search space for RL Zoo: group, blocks, depth, the three coefficients, learning rate, n-step, replay ratio
     """

@@ -218,7 +218,7 @@ def test_runs_with_different_settings_cannot_share_a_folder(files):
 def test_missing_ray_prints_an_error(files, sb3_eqr, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     code, out = sb3_eqr(RUN)
-    assert code == 2 and 'benchmark run needs Ray: pip install ".[benchmark]" in a clone of the repository' in out.err
+    assert code == 2 and 'Ray is not installed. Run pip install ".[benchmark]" in a clone of the repository' in out.err
 
 
 def test_the_command_without_its_extra(monkeypatch):

@@ -220,7 +220,7 @@ def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
     whole = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
     for more, message in (
         ("--seed 2", "leave out --hyperparams, --trained-agent and --seed"),
-        ("-n 500", "at step 1024 already"),
+        ("-n 500", "is already at step 1024"),
     ):
         with pytest.raises(SystemExit):
             sb3_eqr(f"{line} {more} --resume {whole}")
