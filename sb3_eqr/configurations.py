@@ -1,4 +1,4 @@
-"""The named configurations: RL Zoo's YAML files of this package as keyword arguments."""
+"""The named configurations: this package's RL Zoo YAML files as keyword arguments."""
 
 import pathlib
 from typing import Any
@@ -11,10 +11,10 @@ STOCK = "stock"  # the folder of settings for SB3's own agents
 
 def configuration_files() -> dict[str, pathlib.Path]:
     """
-    :return: name -> file, of every file in ``zoo_hyperparams``: "eqr_rainbow", "eqr_bbf", "gl2+aet+r", ..., "stock/dqn"
+    :return: name -> file, for every file in ``zoo_hyperparams``: "eqr_rainbow", "eqr_bbf", "gl2+aet+r", ..., "stock/dqn"
     """
     package = pathlib.Path(__file__).parent
-    folders = (package / "zoo_hyperparams", package.parent / "zoo_hyperparams")  # in a wheel, in a checkout
+    folders = (package / "zoo_hyperparams", package.parent / "zoo_hyperparams")  # installed from a wheel; in a clone
     folder = next(folder for folder in folders if folder.is_dir())
     files = sorted(folder.rglob("*.yml"))
     return {f"{STOCK}/{path.stem}" if path.parent.name == STOCK else path.stem: path for path in files}
@@ -28,10 +28,10 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         narrow = {"net_arch": [512], "features_extractor_kwargs": {"width_scale": 1}}
         EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf", policy_kwargs=narrow, learning_starts=500))
 
-    :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/configurations.md says what each is
+    :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/configurations.md describes each one
     :param env_id: the entry in that file: "atari", or the name of an environment
-    :param changes: arguments that replace those of the file; dictionaries are merged into its dictionaries
-    :raises ValueError: if there is no such file or entry
+    :param changes: arguments that override those of the file; dictionaries are merged
+    :raises ValueError: if the file or the entry does not exist
     """
     try:
         import yaml
@@ -39,17 +39,17 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         raise ImportError("load_configuration needs PyYAML: pip install pyyaml") from error
     files = configuration_files()
     if name not in files:
-        raise ValueError(f"configuration: expected one of {list(files)}, found {name!r}")
+        raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.")
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
-        raise ValueError(f"configuration {name!r}: expected an entry of {list(entries)}, found {env_id!r}")
+        raise ValueError(f"env_id must be one of the entries {list(entries)} of configuration {name!r}, got {env_id!r}.")
     arguments = {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}
     if isinstance(arguments.get("policy_kwargs"), str):
         raise ValueError(
-            f"configuration {name!r}, {env_id!r}: its policy_kwargs are Python that only RL Zoo evaluates. "
-            f"Use sb3-eqr train --conf-file {name}, or write them out."
+            f"configuration {name!r}, {env_id!r}: policy_kwargs must be a dictionary, got Python code, which only RL Zoo "
+            f"evaluates. Use sb3-eqr train --conf-file {name}, or pass the arguments to the constructor yourself."
         )
-    if isinstance(arguments.get("learning_rate"), str):  # RL Zoo's lin_1e-3: from there to 0
+    if isinstance(arguments.get("learning_rate"), str):  # RL Zoo's lin_1e-3: linearly from 1e-3 to 0
         arguments["learning_rate"] = LinearSchedule(float(arguments["learning_rate"].removeprefix("lin_")), 0.0, 1.0)
     return _merged(arguments, changes)
 

@@ -1,4 +1,4 @@
-"""How every picture of this package looks: what belongs to one thing differs from others in more than its colour."""
+"""The style of all plots of this package. Curves differ in line style and marker as well as in colour."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import matplotlib
 
-# Okabe and Ito's colours (https://jfly.uni-koeln.de/color), which the colour-blind distinguish, too.
+# Okabe and Ito's colours (https://jfly.uni-koeln.de/color), which colour-blind readers can distinguish, too.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#000000", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (8, 2, 1, 2, 1, 2)), (0, (3, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")
@@ -40,8 +40,8 @@ class Look(NamedTuple):
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
     """
-    :param names: of curves, in their order
-    :return: name -> how it is drawn; the cycles differ in length, so that no two of the first 66 are alike without colours
+    :param names: names of the curves, in order
+    :return: name -> how to draw the curve. The cycles differ in length, so the first 66 curves differ even without colours
     """
     return {
         name: Look(COLORS[i % len(COLORS)], LINES[i % len(LINES)], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names)
@@ -50,6 +50,6 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
 
 @contextmanager
 def settings() -> Iterator[None]:
-    """Matplotlib's settings for these pictures, put back afterwards."""
+    """Apply Matplotlib's settings for these plots, and restore the previous ones afterwards."""
     with matplotlib.rc_context(SETTINGS):
         yield

@@ -1,4 +1,4 @@
-"""Representation learning without reward: encoder and latent model alone, on random actions (Example 2 of the paper)."""
+"""Representation learning without rewards: trains only the encoder and the latent model, on random actions (Example 2)."""
 
 import warnings
 from typing import Any
@@ -17,15 +17,15 @@ from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
 
-INITIAL_LEARNING_RATE = 1e-3  # to 0, linearly: what is left at the end is the noise of the last updates
-N_WINDOWS = 512  # that are looked at for a collapse
+INITIAL_LEARNING_RATE = 1e-3  # decays linearly to 0, so that the last updates add little noise
+N_WINDOWS = 512  # how many windows are checked for a collapse
 
 
 class StillActions(BaseCallback):
     """
-    Lets κ begin at the identity, and stay there for a while.
+    Start κ at the identity, and keep it there for a while.
 
-    :param until: so many steps of the environments
+    :param until: number of environment steps after which κ is trained
     """
 
     model: EqRQRDQN
@@ -78,47 +78,50 @@ def train_representation(
     device: th.device | str = "auto",
 ) -> EqRQRDQN:
     """
-    τ and κ by the AET loss on random actions, without Q-learning and without rewards. What comes back is an ordinary agent
-    (``td_coef=0``): ``save``, ``sb3-eqr visualize`` and ``load_representation`` take it; its Q head is as it was drawn.
+    Train τ and κ with the AET loss on random actions, without Q-learning and without rewards. Returns an ordinary agent
+    (``td_coef=0``), which works with ``save``, ``sb3-eqr visualize`` and ``load_representation``; its Q head is untrained.
 
-    The defaults are the least that found the sliding ball's circle and torus (docs/representation.md): states that are
-    whitened and have no seam, actions that stay the identity at first, and the contrastive loss. The paper's example as it is
-    stated, ``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``, collapses.
+    The defaults are the minimum that recovered the sliding ball's circle and torus (docs/representation.md): whitened latent
+    states with a parameterization without discontinuities, actions fixed to the identity at first, and the contrastive loss.
+    The paper's example as stated (``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``)
+    collapses.
 
-    :param env: as for :class:`~sb3_eqr.EqRQRDQN`; several environments at once see more of the world
-    :param group: of the blocks, see :func:`~sb3_eqr.common.groups.make_group`
-    :param n_blocks: K; ``None`` as in the policies
+    :param env: as for :class:`~sb3_eqr.EqRQRDQN`; several parallel environments cover more states
+    :param group: group of the blocks, see :func:`~sb3_eqr.common.groups.make_group`
+    :param n_blocks: K; ``None``: as in the policies
     :param total_timesteps: random steps, over all environments; one update per step after ``learning_starts``
     :param policy: "CnnPolicy", "MlpPolicy" or "MultiInputPolicy"
-    :param learning_rate: ``None``: 10⁻³, linearly to 0
-    :param learning_starts: steps before the first update: what is slow shows only where much of the world has been seen
-    :param batch_size: windows per update; with the contrastive loss, one more than the negatives
-    :param prediction_depth: M, how many steps ahead
+    :param learning_rate: ``None``: 10⁻³, decaying linearly to 0
+    :param learning_starts: steps before the first update: slow features emerge only from data that cover the environment
+    :param batch_size: windows per update; with the contrastive loss, one more than the number of negatives
+    :param prediction_depth: M, number of predicted steps
     :param aet_loss: "contrastive" or "distance" (Eq. 18)
     :param symmetry_coef: weight of the GET loss; 0 as in Example 2
-    :param parameterization: of rotations among the states
-    :param whiten: whether states are whitened
-    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, which makes angles linear in what is moved
-    :param still_timesteps: how many steps after ``learning_starts`` actions stay the identity; 0: they start as drawn. Then
-        what changes slowly is learned first (slow feature analysis, Wiskott and Sejnowski 2002,
-        https://doi.org/10.1162/089976602317318938): one turn of a loop and not two, one axis and not a mixture
-    :param policy_kwargs: what else the policy takes
+    :param parameterization: parameterization of rotations in the latent states
+    :param whiten: whether to whiten the latent states
+    :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), as in Example 2; latent angles are then linear in
+        the true positions
+    :param still_timesteps: number of steps after ``learning_starts`` in which actions stay the identity; 0: κ is trained from
+        its random initialisation. With actions fixed, slow features are learned first (slow feature analysis, Wiskott and
+        Sejnowski 2002, https://doi.org/10.1162/089976602317318938): one turn around a loop instead of two, one axis instead
+        of a mixture
+    :param policy_kwargs: additional arguments of the policy
     :param callback: as for ``learn``
     :param progress_bar: as for ``learn``
     :param verbose: as for the agent
-    :param seed: of everything random
+    :param seed: seed of all random generators
     :param device: as for the agent
-    :return: the agent, trained
-    :raises ValueError: for an argument out of its range
+    :return: the trained agent
+    :raises ValueError: if an argument is out of range
     :warns UserWarning: if the representation has collapsed (:func:`~sb3_eqr.visualize.diagnostics.find_verdict`)
     """
     check_number("still_timesteps", still_timesteps, 0, whole=True)
     check_number("total_timesteps", total_timesteps, 1, whole=True)
     if total_timesteps <= learning_starts + still_timesteps:
         raise ValueError(
-            f"total_timesteps: expected more than learning_starts + still_timesteps = {learning_starts + still_timesteps}, "
-            f"found {total_timesteps}. Pass more steps, or lower learning_starts (random steps before the first update) and "
-            "still_timesteps (steps in which actions do nothing)."
+            f"total_timesteps must be > learning_starts + still_timesteps = {learning_starts + still_timesteps}, "
+            f"got {total_timesteps}. Pass more steps, or lower learning_starts (random steps before the first update) or "
+            "still_timesteps (steps in which actions stay the identity)."
         )
     model = EqRQRDQN(
         policy,
@@ -133,11 +136,11 @@ def train_representation(
         exploration_final_eps=1.0,
         prediction_depth=prediction_depth,
         td_coef=0.0,
-        aet_coef=float(prediction_depth),  # the sum over the steps, beside the one step of GET
+        aet_coef=float(prediction_depth),  # makes the AET loss a sum over the steps; the GET loss has one step only
         symmetry_coef=symmetry_coef,
         reward_coef=0.0,
         prioritized_replay=False,
-        shift_pixels=0,  # a shift is what a world of moving things is about
+        shift_pixels=0,  # shifts would hide the motion that is to be learned
         intensity_scale=0.0,
         policy_kwargs={
             "group": group,
@@ -147,13 +150,13 @@ def train_representation(
             "state_dependent_actions": state_dependent_actions,
             "aet_loss": aet_loss,
             "projection": "none",
-            "layer_norm": False,  # whitening does its work
+            "layer_norm": False,  # redundant with whitening
             "head_input": "state",
             "latent_tau": None,
             **({"features_extractor_class": "flatten"} if policy == "MlpPolicy" else {}),
             "noisy": False,
             "dueling": False,
-            "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's own: Table 5's stops small gradients
+            "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's default: the value of Table 5 suppresses small gradients
             **(policy_kwargs or {}),
         },
         verbose=verbose,
@@ -164,20 +167,23 @@ def train_representation(
     still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
     callbacks = [*still, *(one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given)]
     model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
-    if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback has stopped it at once
+    if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback stopped training at once
         _tell(model, {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True})
     return model
 
 
 def _tell(model: EqRQRDQN, remedies: dict[str, bool]) -> None:
     """
-    Warn of a collapse; else say what was found, if verbose.
+    Warn about a collapse; otherwise print the summary of the diagnostics, if verbose.
 
-    :param remedies: what to pass instead -> whether it was not passed already
+    :param remedies: argument that helps -> whether the caller can still pass it
     """
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
     if found.verdict == "collapsed":
         open_remedies = " or ".join(remedy for remedy, is_open in remedies.items() if is_open)
-        warnings.warn(f"train_representation: states and actions are nearly constant. Pass {open_remedies}.")
+        warnings.warn(
+            "train_representation: latent states and actions are nearly constant, the representation has collapsed. "
+            f"Pass {open_remedies}."
+        )
     elif model.verbose > 0:
         print(found.summary)

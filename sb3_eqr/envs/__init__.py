@@ -1,6 +1,6 @@
 """
-Environments. Importing this needs no extra; making an Atari environment needs ``pip install ".[atari]"`` in a clone of the
-repository.
+Environments. Importing this package needs no extra; creating an Atari environment needs ``pip install ".[atari]"`` in a clone
+of the repository.
 """
 
 from typing import Any
@@ -34,7 +34,7 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 def register() -> None:
-    """Register with gymnasium: the worlds above, and MinAtar's games (making one needs ``pip install minatar``)."""
+    """Register the environments above and MinAtar's games with gymnasium (MinAtar needs ``pip install minatar``)."""
     for env_id, arguments in WORLDS.items():
         if env_id not in gym.registry:
             gym.register(env_id, **arguments)

@@ -1,4 +1,4 @@
-"""The Atari-100K protocol of the paper (§7 and Table 5), built of SB3's and gymnasium's wrappers."""
+"""The Atari-100K protocol of the paper (§7 and Table 5), built from SB3's and gymnasium's wrappers."""
 
 import difflib
 import re
@@ -30,28 +30,29 @@ def make_atari100k_env(
     render_mode: str | None = None,
 ) -> VecEnv:
     """
-    Atari as the paper trains on it: up to 30 no-ops, each action for 4 frames of which the last two are maximised, grey
-    84×84, 4 frames stacked, at most 27,000 agent steps per game, no sticky actions, no FIRE press. In training rewards
-    are clipped to their sign and the loss of a life ends an episode; ``Monitor`` sees the raw score of whole games.
+    Create Atari environments as in the paper: up to 30 no-ops, each action repeated for 4 frames with a pixel-wise maximum
+    over the last two, greyscale 84×84 images, 4 stacked frames, at most 27,000 agent steps per game, no sticky actions, no
+    FIRE press. In training, rewards are clipped to their sign and losing a life ends an episode; ``Monitor`` records the raw
+    scores of full games.
 
     :param game: "Pong", "PongNoFrameskip-v4" or "ALE/Pong-v5": all the same environment
     :param n_envs: number of environments
-    :param seed: of the first environment; the others count up
-    :param training: False: rewards raw, an episode is a whole game
+    :param seed: seed of the first environment; each further environment adds 1
+    :param training: ``False``: raw rewards, and an episode is a full game
     :param vec_env_cls: ``DummyVecEnv`` or ``SubprocVecEnv``
     :param vec_env_kwargs: its keyword arguments
     :param monitor_dir: folder for ``Monitor``'s files
-    :param render_mode: ALE's: "rgb_array" for pictures in colour from ``render()``, "human" for a window
-    :return: observations (84, 84, 4), uint8; SB3 transposes them
-    :raises ImportError: without ale-py or OpenCV
-    :raises ValueError: for a game that there is not, with the nearest names, or ``n_envs`` below 1
+    :param render_mode: ALE's render mode: "rgb_array" for colour images from ``render()``, "human" for a window
+    :return: environments with observations of shape (84, 84, 4), uint8; SB3 transposes them
+    :raises ImportError: if ale-py or OpenCV is not installed
+    :raises ValueError: if the game is unknown (the message suggests the nearest names) or ``n_envs`` is below 1
     """
     env_id = atari_env_id(game)
     if n_envs < 1:
-        raise ValueError(f"n_envs: expected at least 1, found {n_envs}")
+        raise ValueError(f"n_envs must be an integer >= 1, got {n_envs}.")
 
     def make_game() -> gym.Env:
-        # Sticky actions, frame skip and frame limit of ALE itself off: the wrappers do what the protocol says.
+        # Turn off ALE's own sticky actions, frame skip and frame limit: the wrappers implement the protocol.
         env = gym.make(
             env_id, render_mode=render_mode, frameskip=1, repeat_action_probability=0.0, max_num_frames_per_episode=None
         )
@@ -71,12 +72,12 @@ def make_atari100k_env(
 
 class Atari100kWrapper(gym.Wrapper):
     """
-    The same preprocessing around one ALE environment, for RL Zoo's ``env_wrapper`` (with ``frame_stack: 4``). SB3's
-    ``evaluate_policy`` still sees raw scores of whole games, from ``Monitor``.
+    The same preprocessing as a wrapper of one ALE environment, for RL Zoo's ``env_wrapper`` (with ``frame_stack: 4``). SB3's
+    ``evaluate_policy`` still reports the raw scores of full games, from ``Monitor``.
 
     :param env: "PongNoFrameskip-v4", or "ALE/Pong-v5" made with ``frameskip=1, repeat_action_probability=0.0``
-    :param training: False: rewards raw, an episode is a whole game
-    :raises ValueError: for an environment that skips frames or repeats actions itself
+    :param training: ``False``: raw rewards, and an episode is a full game
+    :raises ValueError: if the environment itself skips frames or repeats actions
     """
 
     def __init__(self, env: gym.Env, training: bool = True):
@@ -84,8 +85,8 @@ class Atari100kWrapper(gym.Wrapper):
         found = {key: made_with.get(key) for key in ("frameskip", "repeat_action_probability")}
         if found != {"frameskip": 1, "repeat_action_probability": 0.0}:
             raise ValueError(
-                f"Atari100kWrapper: expected an environment made with frameskip=1 and repeat_action_probability=0.0, found "
-                f"{found}. Use the NoFrameskip-v4 name of the game, or RL Zoo's "
+                f"Atari100kWrapper: env must be made with frameskip=1 and repeat_action_probability=0.0, got {found}. "
+                "Use the NoFrameskip-v4 name of the game, or RL Zoo's "
                 "--env-kwargs frameskip:1 repeat_action_probability:0.0."
             )
         super().__init__(_preprocess(_in_agent_steps(env), training))
@@ -104,8 +105,8 @@ def atari_env_id(game: str) -> str:
     """
     :param game: see :func:`make_atari100k_env`; case, "_" and spaces do not matter
     :return: "ALE/<Game>-v5"
-    :raises ImportError: without ale-py
-    :raises ValueError: for a game that there is not
+    :raises ImportError: if ale-py is not installed
+    :raises ValueError: if the game is unknown
     """
     try:
         import ale_py
@@ -116,6 +117,6 @@ def atari_env_id(game: str) -> str:
     bare = re.sub(r"^ALE/|-v5$|NoFrameskip-v4$|[_ ]", "", game)
     if bare.lower() not in games:
         near = difflib.get_close_matches(bare.lower(), games, n=3)
-        hint = f"did you mean {', '.join(games[name][4:-3] for name in near)}?" if near else "see gymnasium.registry"
-        raise ValueError(f"game: expected the name of an Atari game such as 'Pong', found {game!r}; {hint}")
+        hint = f"Did you mean {', '.join(games[name][4:-3] for name in near)}?" if near else "See gymnasium.registry."
+        raise ValueError(f"game must be the name of an Atari game such as 'Pong', got {game!r}. {hint}")
     return games[bare.lower()]

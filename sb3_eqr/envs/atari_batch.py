@@ -1,4 +1,4 @@
-"""Whole Atari games side by side, for evaluation: ALE plays them in its own threads."""
+"""Full Atari games in parallel, for evaluation: ALE runs them in its own threads."""
 
 import os
 from importlib.metadata import PackageNotFoundError, version
@@ -14,21 +14,21 @@ NO_LIMIT = 2**31 - 1  # frames
 
 class AtariBatch:
     """
-    What ``make_atari100k_env(game, n_envs, training=False)`` plays, from ALE's vector environment: the same observations
-    bit by bit, raw rewards, whole games, no sticky actions, no FIRE press. ``send`` returns at once and ``receive``
+    The same games as ``make_atari100k_env(game, n_envs, training=False)``, from ALE's vector environment: bitwise identical
+    observations, raw rewards, full games, no sticky actions, no FIRE press. ``send`` returns at once and ``receive``
     waits, so that the agent can act in another batch meanwhile.
 
-    ALE's own preprocessing is left off: it maximises grey screens of its palette where SB3's wrappers maximise colours
-    and convert them afterwards, and 0.2 % of Pong's pixels differ by up to 16 (docs/results/evaluation_speed.md). Its
-    unscaled screens in colour are those of SB3's ``MaxAndSkipEnv``.
+    ALE's own preprocessing is turned off: it takes the maximum over greyscale screens, whereas SB3's wrappers take it over
+    colours and convert them afterwards, so 0.2 % of Pong's pixels differ by up to 16 (docs/results/evaluation_speed.md).
+    ALE's unscaled colour screens are identical to those of SB3's ``MaxAndSkipEnv``.
 
-    As in SB3's ``NoopResetEnv``, each number of no-ops from 1 to 30 is as likely; the generator is ALE's, so a seed stands
-    for other games than in ``make_atari100k_env``.
+    As in SB3's ``NoopResetEnv``, each number of no-ops from 1 to 30 is equally likely. ALE's generator draws them, so the same
+    seed gives other games than in ``make_atari100k_env``.
 
     :param game: see :func:`~sb3_eqr.envs.atari.make_atari100k_env`
     :param n_envs: number of games
-    :param seed: of the first game; the others count up
-    :param max_steps: agent steps after which a game is over; those of the protocol at most
+    :param seed: seed of the first game; each further game adds 1
+    :param max_steps: maximum number of agent steps per game; capped at the protocol's limit
     """
 
     def __init__(self, game: str, n_envs: int, seed: int, max_steps: int | None = None):
@@ -45,15 +45,15 @@ class AtariBatch:
         self._env = AtariVectorEnv(
             gym.spec(env_id).kwargs["game"],
             n_envs,
-            num_threads=max((os.cpu_count() or 2) - 1, 1),  # one core is the agent's
-            max_num_frames_per_episode=NO_LIMIT,  # ALE would count no-ops; steps are counted here
+            num_threads=max((os.cpu_count() or 2) - 1, 1),  # leaves one core to the agent
+            max_num_frames_per_episode=NO_LIMIT,  # ALE would count no-ops, so steps are counted here
             autoreset_mode=AutoresetMode.SAME_STEP,
             img_height=height,
             img_width=width,
             grayscale=False,
             stack_num=1,
             frameskip=atari.FRAME_SKIP,
-            noop_max=atari.NOOP_MAX + 1,  # ALE draws 0 … noop_max - 1, and 0 is drawn again
+            noop_max=atari.NOOP_MAX + 1,  # ALE draws from 0 … noop_max - 1; 0 is redrawn
             reward_clipping=False,
             use_fire_reset=False,
         )
@@ -80,21 +80,21 @@ class AtariBatch:
 
     def receive(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        :return: observations, (n_envs, 84, 84, 4), of the next game where one is over; rewards, (n_envs,); whether it is
-            over, (n_envs,)
+        :return: observations, (n_envs, 84, 84, 4), of the next game where one has ended; rewards, (n_envs,); whether each
+            game has ended, (n_envs,)
         """
         screens, rewards, game_over, _, info = self._env.recv()
         self._steps += 1
         done = game_over | (self._steps >= self._max_steps)
-        # ALE has begun the next game where one was over, not where the steps were.
+        # ALE has started the next game where one was over, but not where the step limit was reached.
         self._begin(done, screens, np.where(game_over, self._noops_of(info), 0))
         return self._stacked(screens), rewards.astype(np.float64), done
 
     def _begin(self, new: np.ndarray, screens: np.ndarray, n_noops: np.ndarray) -> None:
         """
-        :param new: which games begin, (n_envs,)
-        :param screens: (n_envs, 1, height, width, 3), written to where a game had to begin once more
-        :param n_noops: that it has begun with, (n_envs,); with none, it begins once more
+        :param new: which games have started, (n_envs,)
+        :param screens: (n_envs, 1, height, width, 3), overwritten for games that are started again
+        :param n_noops: number of no-ops at the start of each game, (n_envs,); a game with 0 is started again
         """
         self._steps[new] = 0
         self._stacks[new] = 0
@@ -120,7 +120,7 @@ class AtariBatch:
 
 def has_atari_batch() -> bool:
     """
-    :return: whether ale-py can restart some games of a batch
+    :return: whether the installed ale-py can restart individual games of a batch
     """
     try:
         found = version("ale-py")

@@ -1,4 +1,4 @@
-"""The toy world of prioritised replay: success is one transition among exponentially many failures."""
+"""The toy environment of prioritised replay: one successful transition among exponentially many failures."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ from sb3_eqr.common.validation import check_number
 
 class BlindCliffwalk(gym.Env):
     """
-    The blind cliffwalk (Schaul et al. 2016, Figure 1, https://arxiv.org/abs/1511.05952): in each of n states one of two
-    actions leads on and the other ends the episode; only the right action in the last state is rewarded, with 1.
-    Random play gets there once in 2ⁿ episodes.
+    The blind cliffwalk (Schaul et al. 2016, Figure 1, https://arxiv.org/abs/1511.05952): in each of n states, one of two
+    actions leads to the next state and the other ends the episode; only the right action in the last state is rewarded,
+    with 1. A random policy succeeds once in 2ⁿ episodes.
 
     :param n_states: n ≥ 1
-    :param seed: draws the right action of each state
-    :param render_mode: "rgb_array": a row of squares, the present state white
-    :raises ValueError: for a number of states below 1
+    :param seed: seed for drawing the right action of each state
+    :param render_mode: "rgb_array": a row of squares with the current state in white
+    :raises ValueError: if ``n_states`` is below 1
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
@@ -43,7 +43,8 @@ class BlindCliffwalk(gym.Env):
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """
         :param action: 0 or 1
-        :return: the next state, or the last one seen where the episode ended; reward; whether it ended; no time-outs
+        :return: next state (or the current one at the end of the episode), reward, terminated, truncated (always ``False``)
+            and an empty info
         """
         if action != self.right_actions[self.state]:
             return self.state, 0.0, True, False, {}
@@ -54,7 +55,7 @@ class BlindCliffwalk(gym.Env):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
-        :return: with ``render_mode="rgb_array"`` (32, 32 n_states, 3), uint8
+        :return: with ``render_mode="rgb_array"``: (32, 32 n_states, 3), uint8
         """
         if self.render_mode is None:
             return None

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-PIXELS = 32  # of a picture, for each of the game
+PIXELS = 32  # size of one pixel of the game in the rendered image
 GAMES = {
     "Asterix": "asterix",
     "Breakout": "breakout",
@@ -15,7 +15,7 @@ GAMES = {
 
 
 def register_minatar() -> None:
-    """Register the games under MinAtar's own names: ``MinAtar/<Game>-v0`` has all six actions, ``-v1`` those of use."""
+    """Register the games under MinAtar's own names: ``MinAtar/<Game>-v0`` with all six actions, ``-v1`` with fewer."""
     for name, game in GAMES.items():
         for version, minimal in (("v0", False), ("v1", True)):
             env_id = f"MinAtar/{name}-{version}"
@@ -26,9 +26,9 @@ def register_minatar() -> None:
 
 class ChannelsFirstImage(gym.ObservationWrapper):
     """
-    MinAtar's planes as an image, for ``CnnPolicy``.
+    Convert MinAtar's observations to channels-first images, for ``CnnPolicy``.
 
-    :param env: observations (height, width, channels), bool
+    :param env: environment with observations of shape (height, width, channels), bool
     """
 
     def __init__(self, env: gym.Env):
@@ -46,7 +46,7 @@ class ChannelsFirstImage(gym.ObservationWrapper):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
-        :return: with ``render_mode="rgb_array"`` (320, 320, 3), uint8, where MinAtar itself gives 10×10 floats in [0, 1]
+        :return: with ``render_mode="rgb_array"``: (320, 320, 3), uint8; MinAtar itself returns 10×10 floats in [0, 1]
         """
         picture = self.env.render()
         if not isinstance(picture, np.ndarray) or self.render_mode != "rgb_array":

@@ -1,4 +1,4 @@
-"""The pendulum of the paper (Example 1), seen: a world with the symmetries of O(2) once gravity is off."""
+"""The pendulum of the paper (Example 1) with image observations: it has the symmetries of O(2) without gravity."""
 
 from math import cos, pi, remainder, sin
 from typing import Any
@@ -15,30 +15,30 @@ GRAVITY = 10.0  # m/s²
 TIME_STEP = 0.05  # s
 MAX_SPEED = 8.0  # rad/s
 MAX_TORQUE = 2.0  # N m
-FREE_MAX_TORQUE = 5.0  # N m; one step of it moves the tip of the rod by 0.7 of 48 pixels, where 2 would move it by 0.3
+FREE_MAX_TORQUE = 5.0  # N m; in one step, this moves the tip of the rod by 0.7 of 48 pixels; 2 N m would move it by 0.3
 
 
 class PixelPendulum(gym.Env):
     """
-    A rod that turns about the centre of the picture (EqR, §5, Example 1 and Figure 2), with the dynamics of
+    A rod that turns about the centre of the image (EqR, §5, Example 1 and Figure 2), with the dynamics of
     gymnasium's Pendulum-v1 and discrete torques.
 
     The angle is in radians, 0 upright, positive anticlockwise, in [−π, π]; the angular velocity in rad/s, in [−8, 8].
-    A step of 0.05 s is semi-implicit: ω' = ω + (15 sin θ + 3 u) 0.05, clipped, then θ' = θ + 0.05 ω'. Without gravity the
-    sine goes: then turning the world leaves an action's effect alone and mirroring it, (θ, ω, u) → (−θ, −ω, −u), negates
-    the torque. With gravity the mirror about the vertical is all that is left.
+    A step of 0.05 s is semi-implicit: ω' = ω + (15 sin θ + 3 u) 0.05, clipped, then θ' = θ + 0.05 ω'. Without gravity, the
+    sine term vanishes: rotating the system does not change the effect of an action, and mirroring it,
+    (θ, ω, u) → (−θ, −ω, −u), negates the torque. With gravity, only the reflection about the vertical remains a symmetry.
 
-    The observation is (size, size, 2), uint8: the previous and the present picture, so that the velocity can be seen.
-    ``info`` holds the true "angle" and "velocity". No episode ends.
+    The observation is (size, size, 2), uint8: the previous and the current frame, so that the velocity is observable.
+    ``info`` holds the true "angle" and "velocity". No episode terminates.
 
-    :param gravity: whether there is any. With it, torques up to 2 N m, too weak to lift the rod at once, and the reward
-        of Pendulum-v1, −(θ² + 0.1 ω² + 0.001 u²) of the state before the step, in [−16.3, 0]. Without it, torques up to
-        5 N m, and the reward is 0: any preferred state would break the symmetry.
-    :param size: of the picture, in pixels; at least 36
-    :param n_torques: how many actions there are, evenly spaced from the most negative torque (action 0, clockwise) to its
-        mirror; odd, at least 3: the middle one is no torque
-    :param render_mode: "rgb_array": the present picture, enlarged
-    :raises ValueError: for an argument outside these ranges
+    :param gravity: whether gravity acts. If so, torques are at most 2 N m, too weak to lift the rod at once, and the reward
+        is that of Pendulum-v1, −(θ² + 0.1 ω² + 0.001 u²) of the state before the step, in [−16.3, 0]. Otherwise torques are
+        at most 5 N m, and the reward is 0, because any preferred state would break the symmetry.
+    :param size: height and width of the image, in pixels; at least 36
+    :param n_torques: number of actions, evenly spaced from the most negative torque (action 0, clockwise) to the most
+        positive one; odd, at least 3: the middle one is no torque
+    :param render_mode: "rgb_array": the current frame, enlarged
+    :raises ValueError: if an argument is out of range
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -47,28 +47,28 @@ class PixelPendulum(gym.Env):
         check_number("size", size, SMALLEST_PICTURE, whole=True)
         check_number("n_torques", n_torques, 3, whole=True)
         if n_torques % 2 == 0:
-            raise ValueError(f"n_torques: expected an odd number, so that the middle one is 0, found {n_torques}")
+            raise ValueError(f"n_torques must be odd, so that the middle torque is 0, got {n_torques}.")
         self.gravity = gravity
         self.size = size
         self.render_mode = render_mode
         self.observation_space = spaces.Box(0, 255, (size, size, 2), np.uint8)
         self.action_space = spaces.Discrete(n_torques)
         middle = n_torques // 2
-        # Not linspace: the two halves are each other's negative to the last bit.
+        # Not linspace, so that the two halves are exact negatives of each other.
         self.torques = (MAX_TORQUE if gravity else FREE_MAX_TORQUE) * (np.arange(n_torques) - middle) / middle
         self.angle = 0.0
         self.velocity = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param options: {"angle": any, in radians; "velocity": in [−8, 8] rad/s}. What is not given is drawn uniformly as
+        :param options: {"angle": any angle in radians; "velocity": in [−8, 8] rad/s}. Missing values are drawn uniformly as
             in Pendulum-v1: from [−π, π] and [−1, 1].
         :return: observation, (size, size, 2); {"angle": radians, "velocity": rad/s}
-        :raises ValueError: for other options
+        :raises ValueError: if an option is unknown or its value is invalid
         """
         super().reset(seed=seed)
         options = check_options(options, ["angle", "velocity"])
-        # Both are drawn in any case: an option leaves the other draw as it was.
+        # Always draw both, so that setting one option does not change the other draw.
         drawn = {"angle": self.np_random.uniform(-pi, pi), "velocity": self.np_random.uniform(-1, 1)}
         state = {**drawn, **options}
         check_number("angle", state["angle"], -np.inf)
@@ -79,9 +79,10 @@ class PixelPendulum(gym.Env):
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
-        :param action: which torque, 0 … ``n_torques`` − 1
-        :return: observation, (size, size, 2); reward; no end; no time-outs; {"angle": radians, "velocity": rad/s}
-        :raises ValueError: for another action
+        :param action: index of the torque, 0 … ``n_torques`` − 1
+        :return: observation, (size, size, 2); reward; terminated and truncated, both always ``False``;
+            {"angle": radians, "velocity": rad/s}
+        :raises ValueError: if the action is not in the action space
         """
         check_action(self.action_space, action)
         torque = float(self.torques[action])
@@ -89,7 +90,7 @@ class PixelPendulum(gym.Env):
         weight = 1.5 * GRAVITY * sin(self.angle) if self.gravity else 0.0
         velocity = self.velocity + (weight + 3 * torque) * TIME_STEP
         self.velocity = min(max(velocity, -MAX_SPEED), MAX_SPEED)
-        # remainder, unlike %, is exact and odd: mirrored states stay each other's mirror.
+        # remainder, unlike %, is exact and odd, so mirrored states stay mirrored.
         self.angle = remainder(self.angle + self.velocity * TIME_STEP, 2 * pi)
         return self.draw(self.angle, self.velocity), -cost if self.gravity else 0.0, False, False, self._info()
 
@@ -98,14 +99,14 @@ class PixelPendulum(gym.Env):
 
     def draw(self, angle: float, velocity: float) -> np.ndarray:
         """
-        :param angle: in radians, any
-        :param velocity: in rad/s; the previous angle is ``angle`` − 0.05 ``velocity``, exactly so after a step
-        :return: what the agent sees there, (size, size, 2), uint8
+        :param angle: any angle, in radians
+        :param velocity: in rad/s; the previous angle is ``angle`` − 0.05 ``velocity``, which is exact after a step
+        :return: the observation in that state, (size, size, 2), uint8
         """
         return np.stack([self._picture(angle - velocity * TIME_STEP), self._picture(angle)], axis=2)
 
     def _picture(self, angle: float) -> np.ndarray:
-        """The rod at an angle: (size, size), uint8."""
+        """An image of the rod at an angle: (size, size), uint8."""
         along = np.array([-cos(angle), -sin(angle)])  # rows count downwards, so upright is −1
         centred = np.arange(self.size) + 0.5 - self.size / 2
         rows, columns = centred[:, None], centred[None, :]
@@ -122,7 +123,7 @@ class PixelPendulum(gym.Env):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
-        :return: with ``render_mode="rgb_array"`` (4 size, 4 size, 3), uint8
+        :return: with ``render_mode="rgb_array"``: (4 size, 4 size, 3), uint8
         """
         if self.render_mode is None:
             return None

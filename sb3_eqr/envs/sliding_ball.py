@@ -1,4 +1,4 @@
-"""The sliding ball of the paper (Example 2): a world whose states are SO(2), or two of them."""
+"""The sliding ball of the paper (Example 2): an environment whose state space is SO(2), or SO(2) × SO(2)."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -9,26 +9,27 @@ from gymnasium import spaces
 
 from sb3_eqr.common.validation import check_number
 
-SMALLEST_PICTURE = 36  # of what the default convolutions of CnnPolicy accept
-ENLARGED = 4  # how many pixels of a rendered picture one of an observation becomes
+SMALLEST_PICTURE = 36  # smallest image that the default convolutions of CnnPolicy accept
+ENLARGED = 4  # scale factor from an observation to a rendered image
 
 
 class SlidingBall(gym.Env):
     """
-    A ball on a closed loop (EqR, §5, Example 2 and Figure 3): it leaves the picture at one edge and comes back at the
-    opposite one. One dimension is the paper's; with two the loop is a torus. An action turns its axis by one angle,
-    2π / ``n_steps``, wherever the ball is: SO(2) per axis.
+    A ball on a closed loop (EqR, §5, Example 2 and Figure 3): it leaves the image at one edge and re-enters at the
+    opposite one. The paper uses one dimension; with two, the state space is a torus. Each action rotates one axis by
+    2π / ``n_steps``, independently of the position: SO(2) per axis.
 
-    The observation is (size, size, 1), uint8: a white disc of radius size/8 on black ground, drawn across the edges.
+    The observation is (size, size, 1), uint8: a white disc of radius size/8 on a black background, wrapped at the edges.
     Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state.
 
     :param dimensions: 1, a vertical loop, or 2, a torus
-    :param size: of the picture, in pixels; at least 36
-    :param n_steps: how many equal steps lead around the loop, at least 3
-    :param goal: ``None``: the reward is always 0 and no episode ends. Or a position, ``dimensions`` numbers in [0, 1):
-        reward 1 and the end within half a step of it in every axis; no episode is drawn to start there.
-    :param render_mode: "rgb_array": the picture enlarged, the goal as a faint green ring
-    :raises ValueError: for an argument outside these ranges
+    :param size: height and width of the image, in pixels; at least 36
+    :param n_steps: number of equal steps around the loop, at least 3
+    :param goal: ``None``: the reward is always 0 and no episode terminates. Otherwise a position, ``dimensions`` numbers in
+        [0, 1): within half a step of it in every axis, the reward is 1 and the episode terminates. Randomly drawn starts
+        are never at the goal.
+    :param render_mode: "rgb_array": the enlarged image, with the goal as a faint green ring
+    :raises ValueError: if an argument is out of range
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -52,20 +53,20 @@ class SlidingBall(gym.Env):
         self.observation_space = spaces.Box(0, 255, (size, size, 1), np.uint8)
         self.action_space = spaces.Discrete(2 * dimensions)
         self._start = np.zeros(dimensions)
-        self._moved = np.zeros(dimensions, dtype=np.int64)  # steps since then: whole, so that a full turn is exact
+        self._moved = np.zeros(dimensions, dtype=np.int64)  # steps since the start: integers, so that a full turn is exact
 
     @property
     def position(self) -> np.ndarray:
         """
-        :return: (dimensions,), fractions of the loop in [0, 1): from the top edge down, from the left edge to the right
+        :return: (dimensions,), fractions of the loop in [0, 1), measured from the top edge and from the left edge
         """
         return np.mod(self._start + self._moved / self.n_steps, 1.0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param options: {"position": where the ball starts, ``dimensions`` numbers in [0, 1)}; drawn uniformly without
+        :param options: {"position": initial position, ``dimensions`` numbers in [0, 1)}; drawn uniformly if not given
         :return: observation, (size, size, 1); {"position": (dimensions,)}
-        :raises ValueError: for other options
+        :raises ValueError: if an option is unknown or its value is invalid
         """
         super().reset(seed=seed)
         options = check_options(options, ["position"])
@@ -81,9 +82,9 @@ class SlidingBall(gym.Env):
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
         :param action: 0 up, 1 down, 2 left, 3 right
-        :return: observation, (size, size, 1); 1 at the goal, else 0; whether it is there; no time-outs;
-            {"position": (dimensions,)}
-        :raises ValueError: for another action
+        :return: observation, (size, size, 1); reward, 1 at the goal and 0 elsewhere; terminated, whether the ball is at the
+            goal; truncated, always ``False``; {"position": (dimensions,)}
+        :raises ValueError: if the action is not in the action space
         """
         check_action(self.action_space, action)
         axis, forwards = divmod(int(action), 2)
@@ -93,7 +94,7 @@ class SlidingBall(gym.Env):
 
     def get_action_meanings(self) -> list[str]:
         """
-        :return: a name per action, as ALE's environments have them
+        :return: the name of each action, as in ALE's environments
         """
         return ["UP", "DOWN", "LEFT", "RIGHT"][: 2 * self.dimensions]
 
@@ -106,23 +107,23 @@ class SlidingBall(gym.Env):
     def draw(self, position: Sequence[float] | np.ndarray) -> np.ndarray:
         """
         :param position: (dimensions,), in [0, 1)
-        :return: what the agent sees there, (size, size, 1), uint8
-        :raises ValueError: for another shape or range
+        :return: the observation at that position, (size, size, 1), uint8
+        :raises ValueError: if the position has the wrong shape or is out of range
         """
         distance = self._distance(check_position("position", position, self.dimensions))
         disc = np.clip(self.size / 8 + 0.5 - distance, 0, 1)  # (size, size), how much of each pixel is covered
         return np.rint(255 * disc).astype(np.uint8)[:, :, None]
 
     def _distance(self, position: np.ndarray) -> np.ndarray:
-        """From every pixel's centre the shorter way around the edges to a position, in pixels: (size, size)."""
-        centre = self.size * np.append(position, 0.5)[:2]  # one dimension: half-way across
+        """The periodic distance from each pixel's centre to a position, in pixels: (size, size)."""
+        centre = self.size * np.append(position, 0.5)[:2]  # in one dimension: horizontally centred
         way = np.abs(np.arange(self.size) + 0.5 - centre[:, None])  # (2, size)
         rows, columns = np.minimum(way, self.size - way)
         return np.hypot(rows[:, None], columns[None, :])
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
-        :return: with ``render_mode="rgb_array"`` (4 size, 4 size, 3), uint8
+        :return: with ``render_mode="rgb_array"``: (4 size, 4 size, 3), uint8
         """
         if self.render_mode is None:
             return None
@@ -135,40 +136,40 @@ class SlidingBall(gym.Env):
 
 def check_position(name: str, position: Sequence[float] | np.ndarray, dimensions: int) -> np.ndarray:
     """
-    :param name: of the argument
+    :param name: name of the argument
     :param position: fractions of a closed loop, one per axis
-    :param dimensions: how many axes there are
-    :return: (dimensions,), a copy
-    :raises ValueError: if they are not so many numbers in [0, 1)
+    :param dimensions: number of axes
+    :return: a copy, (dimensions,)
+    :raises ValueError: if ``position`` is not ``dimensions`` numbers in [0, 1)
     """
     found = np.array(position)
     legal = found.shape == (dimensions,) and np.issubdtype(found.dtype, np.number) and np.isrealobj(found)
     if not legal or not np.all((found >= 0) & (found < 1)):
-        raise ValueError(f"{name}: expected {dimensions} numbers in [0, 1), found {position!r}")
+        raise ValueError(f"{name} must be an array of shape ({dimensions},) with values in [0, 1), got {position!r}.")
     return found.astype(np.float64)
 
 
 def check_options(options: dict[str, Any] | None, names: Iterable[str]) -> dict[str, Any]:
     """
-    :param options: of ``reset``
-    :param names: those there are
+    :param options: options of ``reset``
+    :param names: legal option names
     :return: the options, an empty dict for ``None``
-    :raises ValueError: if there is another one
+    :raises ValueError: if an option is unknown
     """
     unknown = set(options or {}) - set(names)
     if unknown:
-        raise ValueError(f"options: expected none but {', '.join(names)}, found {', '.join(map(repr, sorted(unknown)))}")
+        raise ValueError(f"options must only contain {', '.join(names)}, got {', '.join(map(repr, sorted(unknown)))}.")
     return dict(options or {})
 
 
 def check_action(space: spaces.Space, action: Any) -> None:
     """
-    :param space: of actions
-    :param action: a number or, as SB3's ``predict`` gives it, an array of shape ()
-    :raises ValueError: if it is not in the space
+    :param space: the action space
+    :param action: a number or, as returned by SB3's ``predict``, an array of shape ()
+    :raises ValueError: if the action is not in the space
     """
     if not space.contains(action):
-        raise ValueError(f"action: expected one of {space}, found {action!r}")
+        raise ValueError(f"action must be in {space}, got {action!r}.")
 
 
 def enlarge(picture: np.ndarray) -> np.ndarray:
