@@ -1,4 +1,4 @@
-"""The replay buffers live in :mod:`sb3_eqr.common.replay`; this is their old import path."""
+"""The old import path of :mod:`sb3_eqr.common.replay`, kept for compatibility."""
 
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 

@@ -1,4 +1,4 @@
-"""The latent model of SPR (Schwarzer et al. 2021, https://arxiv.org/abs/2007.05929): convolutions move a map of features."""
+"""The latent model of SPR (Schwarzer et al. 2021, https://arxiv.org/abs/2007.05929): convolutions predict the feature map."""
 
 import torch as th
 from torch import nn
@@ -10,14 +10,14 @@ from sb3_eqr.common.networks.encoders import rescaled
 
 class ConvLatentModel(LatentModel):
     """
-    The action as planes beside the C channels, two 3×3 convolutions with ReLUs, batch norm after the first, and each sample's
-    numbers scaled to [0, 1] again (SPR, §2.2 and appendix). It has no GET loss.
+    Appends the action to the C channels as constant planes, applies two 3×3 convolutions with ReLUs, with batch norm after
+    the first, and rescales each sample to [0, 1] (SPR, §2.2 and appendix). It has no GET loss.
 
-    :param map_shape: (C, H, W) of the trunk's features
+    :param map_shape: shape (C, H, W) of the trunk's features
     :param n_actions: A
     :param hidden_dim: width of the hidden layer of r_ψ
     :param reward_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`
-    :param aet_loss: likewise; SPR's is "distance"
+    :param aet_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`; SPR uses "distance"
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class ConvLatentModel(LatentModel):
         self.projection = nn.Identity()  # no GET loss
 
     def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """From x₀, (B, C * H * W), and actions, int64, (B, M), to x̂_1 ... x̂_M, (B, M, C * H * W)."""
+        """Predict x̂_1 ... x̂_M, (B, M, C * H * W), from x₀, (B, C * H * W), and actions, int64, (B, M)."""
         one_hot = F.one_hot(actions, self.n_actions).to(state.dtype)  # (B, M, A)
         planes = one_hot[..., None, None].expand(-1, -1, -1, *self.map_shape[1:])  # (B, M, A, H, W)
         states = [state]

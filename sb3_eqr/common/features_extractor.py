@@ -1,4 +1,4 @@
-"""The encoders live in :mod:`sb3_eqr.common.networks.encoders`; this is their old import path, which YAML files use."""
+"""The old import path of :mod:`sb3_eqr.common.networks.encoders`, kept for YAML files that use it."""
 
 from sb3_eqr.common.networks.encoders import ConvExtractor, GroupFeaturesExtractor, ImpalaExtractor
 

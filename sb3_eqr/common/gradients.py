@@ -1,4 +1,4 @@
-"""From a loss to gradients within their norm, in few operations."""
+"""Computing, clipping and balancing gradients with few operations."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,27 +10,27 @@ from torch.autograd.function import once_differentiable
 
 def clip_grad_norm(parameters: Iterable[nn.Parameter], max_norm: float | None) -> th.Tensor:
     """
-    As PyTorch's ``clip_grad_norm_``, for parameters of one device and dtype, in a fifth of its operations.
+    As PyTorch's ``clip_grad_norm_``, with a fifth of its operations, for parameters with the same device and dtype.
 
-    :param parameters: those without a gradient are left out; at least one has one
-    :param max_norm: of all gradients together, > 0; ``None``: nothing is clipped
+    :param parameters: parameters, at least one with a gradient; those without are ignored
+    :param max_norm: maximum norm of all gradients together, > 0; ``None``: no clipping
     :return: the norm before clipping, ()
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = th.linalg.vector_norm(th.stack(th._foreach_norm(gradients)))
-    if max_norm is not None and (norm.is_cuda or norm > max_norm):  # a GPU would have to be waited for
+    if max_norm is not None and (norm.is_cuda or norm > max_norm):  # on a GPU, the comparison would force a synchronisation
         th._foreach_mul_(gradients, (max_norm / (norm + 1e-6)).clamp(max=1.0))
     return norm
 
 
 def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> None:
     """
-    ``loss.backward()`` for parameters that have no gradient yet or one to forget: theirs are replaced, and nothing is
-    accumulated, which saves an operation for each. A parameter that the loss does not depend on, or a frozen one, has
-    ``None`` then.
+    As ``loss.backward()``, but replaces the gradients of the parameters instead of accumulating them, which saves one
+    operation per parameter. The gradient of a frozen parameter, or of one that the loss does not depend on, becomes
+    ``None``.
 
     :param loss: ()
-    :param parameters: those trained
+    :param parameters: the trained parameters
     """
     trained = []
     for parameter in parameters:
@@ -43,13 +43,13 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
 
 def branch(features: th.Tensor, share: float | None, gram: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Features for the TD loss and for the auxiliary losses: the same numbers, but the gradients of both are kept apart where
-    they meet, and the auxiliary one is scaled there so that its norm is at most a share of the TD loss's.
+    Return the features twice, once for the TD loss and once for the auxiliary losses. The backward pass keeps the two
+    gradients separate, and scales the auxiliary gradient so that its norm is at most ``share`` times that of the TD gradient.
 
     :param features: (B, F)
-    :param share: ≥ 0; ``None``: nothing is scaled
-    :param gram: (2, 2), filled in by the backward pass: the inner products of TD and auxiliary gradient
-    :return: (B, F) twice
+    :param share: ≥ 0; ``None``: no scaling
+    :param gram: (2, 2), filled by the backward pass with the inner products of the TD and the auxiliary gradient
+    :return: the features for the TD loss and for the auxiliary losses, (B, F) each
     """
     return _Branch.apply(features, share, gram)
 

@@ -1,8 +1,8 @@
 """
-The latent model: how actions move states, and the three losses that teach it (EqR, §5 and §6).
+The latent model: how actions move latent states, and the three losses that train it (EqR, §5 and §6).
 
-It receives tensors, a mask and callables, and knows neither Q-learning nor Atari.
-Shapes: B batch, M prediction depth, K blocks, D size of the flat state, A number of actions.
+It takes tensors, a mask and callables, and is independent of Q-learning and Atari.
+Shapes: B batch size, M prediction depth, K blocks, D size of the flat latent state, A number of actions.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Projection = Callable[[th.Tensor], th.Tensor]
 
 # name -> (outputs of the reward network, loss)
 REWARD_LOSSES = {"mse": (1, reward_mse), "categorical": (3, reward_cross_entropy)}
-# name -> loss of predictions and targets, (B, M, P), and the mask, (B, M)
+# name -> loss as a function of predictions and targets, (B, M, P), and the mask, (B, M)
 AET_LOSSES: dict[str, Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]] = {
     "distance": lambda prediction, target, mask: normalized_distance(prediction, target),
     "contrastive": contrastive_loss,
@@ -31,19 +31,19 @@ AET_LOSSES: dict[str, Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]] = 
 
 class LatentModel(nn.Module):
     """
-    The reward network r_ψ and the losses; how actions move states is a subclass's ``rollout``.
+    The reward network r_ψ and the losses. Subclasses define how actions move latent states (``rollout``).
 
     :param state_dim: D
     :param n_actions: A
     :param hidden_dim: width of the hidden layer of r_ψ
-    :param reward_loss: "mse" (Eq. 17) or "categorical" (three signs, as in the authors' released code)
+    :param reward_loss: "mse" (Eq. 17) or "categorical" (the sign of the reward, as in the authors' released code)
     :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
-    :param embedding: from the encoder's features to states; ``None``: its features are the states
-    :raises ValueError: for an unknown loss
+    :param embedding: module from the encoder's features to latent states; ``None``: the features are the latent states
+    :raises ValueError: if a loss is unknown
     """
 
-    transition: Any  # its copy moves with the target
-    projection: nn.Module  # likewise: b of the GET loss
+    transition: Any  # has a target copy
+    projection: nn.Module  # b of the GET loss; has a target copy
     has_symmetry_loss = False
 
     def __init__(
@@ -56,10 +56,10 @@ class LatentModel(nn.Module):
         embedding: nn.Module | None = None,
     ):
         super().__init__()
-        self.embedding = embedding or nn.Identity()  # its copy moves with the target
+        self.embedding = embedding or nn.Identity()  # has a target copy
         for name, found, legal in (("reward_loss", reward_loss, REWARD_LOSSES), ("aet_loss", aet_loss, AET_LOSSES)):
             if found not in legal:
-                raise ValueError(f"{name}: expected one of {list(legal)}, found {found!r}")
+                raise ValueError(f"{name} must be one of {list(legal)}, got {found!r}.")
         self.n_actions = n_actions
         self.aet_loss = aet_loss
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
@@ -78,21 +78,21 @@ class LatentModel(nn.Module):
         target_project: Projection,
     ) -> LatentLosses:
         """
-        The losses of Eq. 18 and 19, per sample; those of the rollout are means over its valid steps, where the paper writes
-        sums. ``None`` for ``rewards``, ``target`` or ``project`` leaves the reward, the GET or the AET loss out.
+        Compute the losses of Eq. 18 and 19, per sample. The losses of the rollout are means over its valid steps, whereas the
+        paper uses sums. ``None`` for ``rewards``, ``target`` or ``project`` disables the reward, the GET or the AET loss.
 
         :param state: x₀ = τ(s_t), online, (B, D)
         :param actions: a_t ... a_{t+M-1}, int64, (B, M)
         :param rewards: r_{t+1} ... r_{t+M}, (B, M)
         :param mask: 1 where the episode had not ended before step t+m, (B, M)
         :param target_state: x̄₀ from the target encoder, without gradient, (B, D)
-        :param target_rollout: x̄₁ ... x̄_M, likewise, (B, M, D); ``None`` without AET
-        :param target: the target copy of this model, in eval mode, its parameters frozen
+        :param target_rollout: x̄₁ ... x̄_M from the target encoder, without gradient, (B, M, D); ``None`` without AET loss
+        :param target: the target copy of this model, in eval mode, with frozen parameters
         :param project: p, (N, D) -> (N, P)
         :param target_project: p̄
-        :return: three losses, (B,) each; ``None`` for one that is off
+        :return: three losses, (B,) each; ``None`` for a disabled loss
         """
-        # Past the end there is no action: a constant one keeps the mask's promise even through batch statistics.
+        # Past the end of the episode, set the action to 0, so that masked steps cannot leak through batch statistics.
         actions = actions * mask.long()  # (B, M)
         predicted = self.rollout(state, actions)  # (B, M, D)
         rows = predicted.flatten(0, 1)  # (B * M, D)
@@ -111,29 +111,30 @@ class LatentModel(nn.Module):
         return LatentLosses(aet, symmetry, reward)
 
     def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """From x₀, (B, D), and actions, int64, (B, M), to x̂_1 ... x̂_M, (B, M, D)."""
+        """Predict x̂_1 ... x̂_M, (B, M, D), from x₀, (B, D), and actions, int64, (B, M)."""
         raise NotImplementedError
 
     def symmetry_loss(
         self, state: th.Tensor, predicted: th.Tensor, actions: th.Tensor, target_state: th.Tensor, target: Any
     ) -> th.Tensor:
-        """The GET loss, where the model has one: from x₀, x̂₁ and x̄₀, (B, D) each, and a_t, (B,), to (B,)."""
+        """The GET loss, (B,), if the model has one, from x₀, x̂₁ and x̄₀, (B, D) each, and a_t, (B,)."""
         raise NotImplementedError
 
 
 class GroupLatentModel(LatentModel):
     """
-    κ (actions to group elements), ρ (how a symmetry of states acts on actions) and b (its projection), beside r_ψ.
+    κ (maps actions to group elements), ρ (how a symmetry of states acts on actions), b (the projection of the GET loss) and
+    r_ψ.
 
-    :param group: of each block
+    :param group: group of each block
     :param n_blocks: K
     :param n_actions: A
-    :param hidden_dim: width of every hidden layer, and of b; 256 in appendix B.4
+    :param hidden_dim: width of all hidden layers and of b; 256 in appendix B.4
     :param reward_loss: as in :class:`LatentModel`
-    :param aet_loss: likewise
-    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2
+    :param aet_loss: as in :class:`LatentModel`
+    :param state_dependent_actions: ``True``: κ(s, a); ``False``: κ(a), as in Example 2
     :param embedding: as in :class:`LatentModel`
-    :raises ValueError: for an unknown loss
+    :raises ValueError: if a loss is unknown
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class GroupLatentModel(LatentModel):
         self.state_dependent_actions = state_dependent_actions
         if state_dependent_actions:
             self.transition = HiddenLayer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
-        else:  # without a norm: statistics of a batch of actions would move κ(a) with the draw
+        else:  # no batch norm: κ(a) would vary with the actions drawn into the batch
             layers = nn.Linear(n_actions, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, algebra_dim)
             self.transition = nn.Sequential(*layers)
         self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim)  # ρ
@@ -165,7 +166,7 @@ class GroupLatentModel(LatentModel):
 
     def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1} (Eq. 10): from x₀, (B, D), and actions, int64, (B, M), to x̂_1 ... x̂_M, (B, M, D).
+        Predict x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1} (Eq. 10), (B, M, D), from x₀, (B, D), and actions, int64, (B, M).
         """
         if self.state_dependent_actions:
             return rollout(self.group, state, actions, self.transition)
@@ -175,28 +176,28 @@ class GroupLatentModel(LatentModel):
         return th.stack(states[1:], dim=1)
 
     def action_params(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """κ(x, a), or κ(a): a state, (B, D), and actions, int64, (B,), to parameters of K elements, (B, K * num_params)."""
+        """Parameters of κ(x, a) or κ(a), (B, K * num_params), from states, (B, D), and actions, int64, (B,)."""
         one_hot = F.one_hot(actions, self.n_actions).to(state.dtype)  # (B, A)
         return self.transition(th.cat([state, one_hot], dim=1) if self.state_dependent_actions else one_hot)
 
     def action_element(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """κ(x, a), or κ(a), as K group elements: a state, (B, D), and actions, int64, (B,), to (B, K, *element_shape)."""
+        """κ(x, a) or κ(a) as group elements, (B, K, *element_shape), from states, (B, D), and actions, int64, (B,)."""
         return self.element(self.action_params(state, actions))
 
     def act(self, elements: th.Tensor, state: th.Tensor) -> th.Tensor:
-        """Elements · state: (B, K, *element_shape) and (B, D) to (B, D)."""
+        """Apply group elements, (B, K, *element_shape), to states, (B, D)."""
         return self.group.compose(elements, self.blocks(state)).flatten(1)
 
     def _act(self, params: th.Tensor, state: th.Tensor) -> th.Tensor:
-        """As :meth:`act`, of elements by their parameters, (B, K * num_params)."""
+        """As :meth:`act`, with elements given by their parameters, (B, K * num_params)."""
         return self.act(self.element(params), state)
 
     def symmetry_loss(
         self, state: th.Tensor, predicted: th.Tensor, actions: th.Tensor, target_state: th.Tensor, target: "GroupLatentModel"
     ) -> th.Tensor:
         """
-        Eq. 19: τ_g moves the predicted next state x̂₁; ρ(τ_g) κ̄ moves the partner's state; both should arrive together. From
-        x₀, x̂₁ and x̄₀, (B, D) each, and a_t, (B,), to (B,).
+        Eq. 19: τ_g acts on the predicted next state x̂₁, and ρ(τ_g) κ̄ on the state of a random partner; both results should
+        coincide. Computes (B,) from x₀, x̂₁ and x̄₀, (B, D) each, and a_t, (B,).
         """
         partner = target_state[th.randint(len(state), (len(state),), device=state.device)]  # x̄_j of Algorithm 1
         with th.no_grad():  # τ_g carries no gradient, as in the authors' code
@@ -207,9 +208,9 @@ class GroupLatentModel(LatentModel):
         return normalized_distance(self.projection(moved_prediction), target.projection(moved_partner))
 
     def blocks(self, state: th.Tensor) -> th.Tensor:
-        """The blocks of a flat state: (B, D) to (B, K, *element_shape)."""
+        """Split flat states, (B, D), into blocks, (B, K, *element_shape)."""
         return state.view(-1, self.n_blocks, *self.group.element_shape)
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        """Group elements from their parameters: (B, K * num_params) to (B, K, *element_shape)."""
+        """Group elements, (B, K, *element_shape), from their parameters, (B, K * num_params)."""
         return self.group.element(params.view(-1, self.n_blocks, self.group.num_params))

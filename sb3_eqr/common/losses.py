@@ -19,8 +19,9 @@ def normalized_distance(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
 
 class _NormalizedDistance(th.autograd.Function):
     """
-    d = ‖ŷ − ȳ̂‖² of directions. Its gradient by hand, since autograd needs four times as many operations: with δ = ŷ − ȳ̂ it is
-    2 (δ − ŷ d/2) / ‖y‖ for the prediction, the same of −δ for the target, because ŷ · δ = 1 − ŷ · ȳ̂ = d/2.
+    d = ‖ŷ − ȳ̂‖² of unit vectors, with a hand-written gradient, because autograd needs four times as many operations. With
+    δ = ŷ − ȳ̂, the gradient is 2 (δ − ŷ d/2) / ‖y‖ for the prediction, because ŷ · δ = 1 − ŷ · ȳ̂ = d/2, and the same with −δ
+    for the target.
     """
 
     @staticmethod
@@ -45,23 +46,23 @@ class _NormalizedDistance(th.autograd.Function):
         return tuple(found)
 
 
-TEMPERATURE = 0.2  # of contrastive_loss; 0.07 to 0.5 are in use, smaller ones look at the nearest negatives only
+TEMPERATURE = 0.2  # of contrastive_loss; common values are 0.07 to 0.5, and smaller ones weigh only the nearest negatives
 
 
 def contrastive_loss(prediction: th.Tensor, target: th.Tensor, mask: th.Tensor) -> th.Tensor:
     """
-    InfoNCE (van den Oord et al. 2018, Eq. 4, https://arxiv.org/abs/1807.03748): the cross-entropy of finding a prediction's
-    own target among those of the batch at the same step, by the cosine of their angle over ``TEMPERATURE``. A constant
-    costs log B, so that a collapse does not pay.
+    InfoNCE (van den Oord et al. 2018, Eq. 4, https://arxiv.org/abs/1807.03748): the cross-entropy of identifying a
+    prediction's own target among the targets of the batch at the same step, with the cosine similarity divided by
+    ``TEMPERATURE`` as logits. A constant representation costs log B, so a collapse does not minimise the loss.
 
     :param prediction: (B, M, P)
     :param target: (B, M, P)
-    :param mask: (B, M); where it is 0, a target is no other's negative
+    :param mask: (B, M); targets with mask 0 do not serve as negatives
     :return: (B, M), ≥ 0
     """
     cosines = th.einsum("bmp,nmp->bnm", F.normalize(prediction, dim=-1), F.normalize(target, dim=-1))  # (B, B, M)
     own = th.arange(len(prediction), device=prediction.device)  # (B,)
-    counts = (mask > 0) | (own[:, None, None] == own[:, None])  # (B, B, M): its own target counts in any case
+    counts = (mask > 0) | (own[:, None, None] == own[:, None])  # (B, B, M): a sample's own target always counts
     logits = (cosines / TEMPERATURE).masked_fill(~counts, -th.inf)
     return F.cross_entropy(logits, own[:, None].expand(mask.shape), reduction="none")
 
@@ -84,31 +85,31 @@ def quantile_huber_loss(current: th.Tensor, target: th.Tensor) -> th.Tensor:
 
 def categorical_projection(values: th.Tensor, probabilities: th.Tensor, v_min: float, v_max: float) -> th.Tensor:
     """
-    A distribution on any values, projected onto as many evenly spaced atoms on [v_min, v_max]: each value is clipped to
-    that range and gives its probability to the two atoms beside it, the nearer one more
-    (Bellemare et al. 2017, Eq. 7, https://arxiv.org/abs/1707.06887). The mass is kept.
+    Project a distribution over arbitrary values onto the same number of evenly spaced atoms on [v_min, v_max]: each value is
+    clipped to that range, and its probability is split between its two neighbouring atoms in proportion to proximity
+    (Bellemare et al. 2017, Eq. 7, https://arxiv.org/abs/1707.06887). The total probability is preserved.
 
-    :param values: in any order, (B, N)
-    :param probabilities: of these values, (B, N)
+    :param values: values in any order, (B, N)
+    :param probabilities: their probabilities, (B, N)
     :param v_min: the first atom
     :param v_max: the last atom, > v_min
     :return: probabilities of the atoms, (B, N)
     """
     n_atoms = values.shape[1]
-    # In units of atoms, so that the two shares of a value add up to 1 exactly.
+    # In units of the atom spacing, so that the two shares of a value add up to exactly 1.
     positions = ((values - v_min) * ((n_atoms - 1) / (v_max - v_min))).clamp(0, n_atoms - 1)  # (B, N)
     atoms = th.arange(n_atoms, device=values.device, dtype=values.dtype)  # (N,)
-    shares = th.rsub((positions[:, :, None] - atoms).abs_(), 1).clamp_(min=0)  # (B, N, N): of each value, to each atom
-    return shares.mul_(probabilities[:, :, None]).sum(dim=1)  # no matrix product: it may be of lower precision on GPU
+    shares = th.rsub((positions[:, :, None] - atoms).abs_(), 1).clamp_(min=0)  # (B, N, N): of each value for each atom
+    return shares.mul_(probabilities[:, :, None]).sum(dim=1)  # not a matrix product, whose precision may be lower on GPU
 
 
 def categorical_loss(logits: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Cross-entropy of a predicted distribution, and the KL divergence from it to the target: the same number less the
-    target's own entropy, so that a transition that is predicted as well as can be has priority 0
-    (the priority of Rainbow, https://arxiv.org/abs/1710.02298).
+    Cross-entropy of a predicted distribution with the target, and the KL divergence, which is the cross-entropy minus the
+    target's entropy. The KL divergence is the priority of Rainbow (https://arxiv.org/abs/1710.02298): it is 0 for a
+    perfectly predicted transition.
 
-    :param logits: of the atoms, (B, N)
+    :param logits: logits of the atoms, (B, N)
     :param target: probabilities of the atoms, without gradient, (B, N)
     :return: cross-entropy, (B,), and KL(target ‖ prediction) ≥ 0 without gradient, (B,)
     """
@@ -129,10 +130,10 @@ def reward_mse(prediction: th.Tensor, reward: th.Tensor) -> th.Tensor:
 
 def reward_cross_entropy(logits: th.Tensor, reward: th.Tensor) -> th.Tensor:
     """
-    Cross-entropy over the three signs of a reward (−, 0, +): the form that the authors' released code uses.
+    Cross-entropy over the three signs of a reward (−, 0, +), as in the authors' released code.
 
     :param logits: (..., 3)
-    :param reward: (...), any size; only its sign counts
+    :param reward: (...); only its sign counts
     :return: (...)
     """
     sign = reward.sign().long() + 1  # 0, 1, 2

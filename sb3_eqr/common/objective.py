@@ -1,4 +1,4 @@
-"""What one update minimises (Eq. 21): samples in, loss terms out. How they are applied is ``EqRAlgorithm.train``."""
+"""The objective of one update (Eq. 21): computes loss terms from samples. ``EqRAlgorithm.train`` applies them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
@@ -18,7 +18,7 @@ from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplay
 
 
 class LossCoefs(NamedTuple):
-    """The weights λ ≥ 0 of the loss terms; a term of weight 0 is not computed."""
+    """The weights λ ≥ 0 of the loss terms; a term with weight 0 is not computed."""
 
     td: float
     aet: float
@@ -27,19 +27,19 @@ class LossCoefs(NamedTuple):
 
 
 class LossTerms(NamedTuple):
-    """The loss terms of an update, one number per sample, and what follows from them. ``None``: that term is off."""
+    """The loss terms of an update, one number per sample, and derived quantities. ``None``: the term is disabled."""
 
     td: th.Tensor | None  # (B,)
     aet: th.Tensor | None  # (B,)
     symmetry: th.Tensor | None  # (B,)
     reward: th.Tensor | None  # (B,)
     loss: th.Tensor  # (): the mean of their sum, weighted by coefficients and replay weights (Eq. 21)
-    priorities: th.Tensor | None = None  # (B,), ≥ 0, no gradient: new ones of the samples, by the TD loss
+    priorities: th.Tensor | None = None  # (B,), ≥ 0, no gradient: new priorities of the samples, from the TD loss
     q_values: th.Tensor | None = None  # (B,), no gradient: Q(s_t, a_t)
-    gram: th.Tensor | None = None  # (2, 2), of TD and auxiliary gradient at the state, after the backward pass
+    gram: th.Tensor | None = None  # (2, 2): inner products of TD and auxiliary gradient, filled by the backward pass
 
     def metrics(self) -> dict[str, th.Tensor]:
-        """What is logged: scalars without gradient."""
+        """The metrics to log: scalars without gradient."""
         terms = {f"{name}_loss": term for name, term in zip(self._fields[:4], self[:4], strict=True) if term is not None}
         if self.q_values is not None:
             terms["mean_q_value"] = self.q_values
@@ -54,12 +54,12 @@ class LossTerms(NamedTuple):
 
 
 class Following(NamedTuple):
-    """What the objective needs of observations that carry no gradient."""
+    """Encodings without gradient that the objective needs."""
 
-    next_features: th.Tensor  # (B, F): by the target encoder, after the n-step transition; empty without TD loss
-    chooser_features: th.Tensor  # (B, F): the same by the encoder of the network that chooses the next action
+    next_features: th.Tensor  # (B, F): from the target encoder, after the n-step transition; empty without TD loss
+    chooser_features: th.Tensor  # (B, F): the same, from the encoder of the network that chooses the next action
     start: th.Tensor  # (B, D): x̄₀
-    rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, of the AET loss
+    rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, for the AET loss
 
 
 class Objective:
@@ -70,8 +70,8 @@ class Objective:
     :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
     :param shift_pixels: random shift of images, in pixels, ≥ 0
     :param intensity_scale: random intensity of images, ≥ 0
-    :param aux_gradient_share: largest norm of the auxiliary losses' gradient at the state, as a share of the TD loss's;
-        ``None``: no limit
+    :param aux_gradient_share: maximum norm of the auxiliary losses' gradient at the features, as a share of the TD
+        gradient's norm; ``None``: no limit
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class Objective:
         self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: LossCoefs) -> LossTerms:
-        """The terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
+        """The loss terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
         features = self.policy.online.features_extractor(observations)
-        # (B, F): TD and auxiliary losses meet here and nowhere else, so this is where their gradients are weighed.
+        # (B, F): TD and auxiliary losses share only these features, so their gradients are balanced here.
         for_head = for_state = features
         gram = None
         if coefs.td > 0 and samples.mask is not None:
@@ -112,7 +112,7 @@ class Objective:
     def _encode_following(
         self, samples: SequenceReplayBufferSamples, observations: PyTorchObs, state: th.Tensor, coefs: LossCoefs
     ) -> Following:
-        """All that is encoded without gradient. The target copy sees s_t in the same augmentation as the online encoder."""
+        """Encode everything that needs no gradient. The target copy sees s_t with the online encoder's augmentation."""
         policy, embedding = self.policy, self.policy.latent_model_target.embedding
         has_td, has_latent = coefs.td > 0, samples.mask is not None
         is_separate, as_online = policy.latent_target is not policy.target, policy.latent_target_encodes_as_online
@@ -120,7 +120,7 @@ class Objective:
         of_latent = [observations] if has_latent and not as_online else []
         chooser, needs_chooser = None, has_td and self.double_q and not policy.target_encodes_as_online
         if needs_chooser and is_separate and as_online:
-            of_latent = of_target  # encodes as the online encoder, in one pass with the rollout
+            of_latent = of_target  # this encoder equals the online one, so encode in one pass with the rollout
         elif needs_chooser:
             chooser = policy.online.features_extractor(of_target[0])
         rollout = [flat(samples.rollout_observations)] if has_latent and coefs.aet > 0 else []
@@ -130,7 +130,7 @@ class Objective:
         if is_separate:
             passes = chain(encode(encoder, of_target), encode(latent_encoder, pieces))
         else:
-            passes = encode(encoder, chain(of_target, pieces))  # one tensor for each of the batches
+            passes = encode(encoder, chain(of_target, pieces))  # one tensor per batch
         next_features = next(passes) if has_td else state.new_empty(0)
         if needs_chooser and chooser is None:
             chooser = next(passes)
@@ -144,7 +144,7 @@ class Objective:
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
         online, target, n_samples = self.policy.online, self.policy.target, len(state)
-        # One pass of the online head, with one draw of noise, for both of its uses.
+        # One pass of the online head, with one draw of noise, for both uses.
         states = [state, following.chooser_features] if self.double_q else [state]
         outputs = online.head(th.cat(states), noisy=True)  # (B or 2 B, N, A)
         with th.no_grad():
@@ -178,14 +178,14 @@ class Objective:
 
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Outputs of a head, (B, N, A), for actions, (B, 1): (B, N)."""
+    """Select the outputs of a head, (B, N, A), for given actions, (B, 1): (B, N)."""
     return th.take_along_dim(outputs, actions[..., None], dim=2).squeeze(dim=2)
 
 
 class Augmentation:
     """
-    What the networks see in an update: images (of a dict, its images) are shifted, then their intensity is scaled, then SB3's
-    ``preprocess_obs``. ``normalize_images``: whether images are bytes, which SB3 divides by 255; else they are floats already.
+    Prepare observations for the networks in an update: shift images (also those in a dict), scale their intensity, then apply
+    SB3's ``preprocess_obs``. ``normalize_images``: whether images are bytes, which SB3 divides by 255, or already floats.
     """
 
     def __init__(self, observation_space: spaces.Space, normalize_images: bool, shift_pixels: int, intensity_scale: float):
@@ -197,7 +197,7 @@ class Augmentation:
         self.intensity_scale = intensity_scale
 
     def __call__(self, observations: PyTorchObs) -> PyTorchObs:
-        """Observations, (B, *obs_shape) or a dict of these, to what a features extractor takes: floats."""
+        """Map observations, (B, *obs_shape) or a dict of these, to floats for a features extractor."""
         if isinstance(observations, dict):
             return {key: self._part(key, obs) for key, obs in observations.items()}
         return self._part("", observations)
@@ -206,7 +206,7 @@ class Augmentation:
         if key in self.image_keys:
             if self.shift_pixels > 0:
                 observations = random_shift(observations, self.shift_pixels)
-            if self.intensity_scale > 0:  # in one pass with the division that preprocess_obs makes: no tensor here is larger
+            if self.intensity_scale > 0:  # in one pass with the division of preprocess_obs: this is the largest tensor
                 unit = 1 / 255 if self._normalize_images else 1.0
                 return random_intensity(observations, self.intensity_scale, unit).float()
             if self._normalize_images:
@@ -214,11 +214,11 @@ class Augmentation:
         return preprocess_obs(observations, self._spaces[key], self._normalize_images)  # type: ignore[return-value]
 
 
-_PIECE = 2 << 20  # numbers in the observations of one pass on a CPU: 8 MiB as floats, 74 stacks of Atari frames
+_PIECE = 2 << 20  # numbers per pass on a CPU: 8 MiB as floats, 74 stacks of Atari frames
 
 
 def flat(observations: PyTorchObs | None) -> PyTorchObs:
-    """Observations of a rollout, (B, M, ...), as one batch, (B * M, ...)."""
+    """Flatten the observations of a rollout, (B, M, ...), into one batch, (B * M, ...)."""
     assert observations is not None
     if isinstance(observations, dict):
         return {key: obs.flatten(0, 1) for key, obs in observations.items()}
@@ -227,8 +227,8 @@ def flat(observations: PyTorchObs | None) -> PyTorchObs:
 
 def in_pieces(observations: PyTorchObs) -> Iterator[PyTorchObs]:
     """
-    Observations, (N, ...), cut into what a pass without gradient takes at a time: on a CPU as much as its caches hold, in
-    blocks of memory that the C library keeps, whatever M; elsewhere everything.
+    Split observations, (N, ...), for passes without gradient. On a CPU, each piece fits into the caches, and into memory
+    blocks that the C library reuses, for any M; on other devices there is a single piece.
     """
     tensors = tensors_of(observations)
     if size_of(observations) <= _limit(observations):
@@ -240,10 +240,11 @@ def in_pieces(observations: PyTorchObs) -> Iterator[PyTorchObs]:
 
 def encode(encoder: nn.Module, batches: Iterable[PyTorchObs]) -> Iterator[th.Tensor]:
     """
-    Features of each batch of preprocessed observations, (N, D). Batches that are small together are one pass.
+    Encode batches of preprocessed observations; consecutive small batches share one pass.
 
     :param encoder: a features extractor
     :param batches: (N, ...) each, N may differ
+    :return: the features of each batch, (N, D)
     """
     waiting: list[PyTorchObs] = []
     for batch in batches:
@@ -267,12 +268,12 @@ def _in_one_pass(encoder: nn.Module, batches: list[PyTorchObs]) -> Sequence[th.T
 
 
 def tensors_of(observations: PyTorchObs) -> list[th.Tensor]:
-    """Of a dict its values, else the one tensor."""
+    """The values of a dict, or the single tensor."""
     return list(observations.values()) if isinstance(observations, dict) else [observations]
 
 
 def size_of(observations: PyTorchObs) -> int:
-    """Numbers in all tensors."""
+    """The number of elements in all tensors."""
     return sum(tensor.numel() for tensor in tensors_of(observations))
 
 
@@ -282,8 +283,9 @@ def _limit(observations: PyTorchObs) -> float:
 
 def keep_freed_memory() -> None:
     """
-    The C library of Linux gives large blocks back to the system and takes them again page by page, thousands of page faults
-    per update of Atari frames. It learns what is large from the largest block freed so far (mallopt(3), M_MMAP_THRESHOLD;
-    blocks above 32 MiB do not count), and then keeps up to twice as much. So one such block is freed.
+    Make the C library keep freed memory. On Linux, it returns large blocks to the system and requests them again page by
+    page, which causes thousands of page faults per update with Atari frames. Its threshold for large blocks adapts to the
+    largest block freed so far (mallopt(3), M_MMAP_THRESHOLD; blocks above 32 MiB do not count), and it then keeps up to
+    twice as much. This function therefore frees one such block.
     """
     np.empty(31 << 20, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Which optimiser, and what it is given."""
+"""Optimisers: lookup by name, defaults and weight decay."""
 
 from typing import Any
 
@@ -11,22 +11,22 @@ ADAM_EPS = 1.5e-4  # Table 5
 
 
 def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
-    """A class, or by its name in ``torch.optim``; raises ValueError for an unknown name."""
+    """Resolve an optimiser given as a class or by its name in ``torch.optim``; raises ValueError for an unknown name."""
     if not isinstance(optimizer, str):
         return optimizer
     found = getattr(th.optim, optimizer, None)
     if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
-        raise ValueError(f"optimizer_class: expected a class or a name in torch.optim such as 'AdamW', found {optimizer!r}")
+        raise ValueError(f"optimizer_class must be a class or a name in torch.optim such as 'AdamW', got {optimizer!r}.")
     return found
 
 
 def set_adam_defaults(policy_kwargs: dict[str, Any], device: th.device) -> None:
     """
-    Fill in what is not given: Adam, and for Adam and AdamW the epsilon of Table 5 and one kernel for all parameters, where
-    PyTorch's default has six for each.
+    Set defaults: Adam, and for Adam and AdamW the epsilon of Table 5 and the fused implementation, which needs one kernel for
+    all parameters instead of six for each.
 
-    :param policy_kwargs: of an agent, changed in place
-    :param device: of the agent
+    :param policy_kwargs: the agent's ``policy_kwargs``, changed in place
+    :param device: the agent's device
     """
     policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
     if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
@@ -36,7 +36,7 @@ def set_adam_defaults(policy_kwargs: dict[str, Any], device: th.device) -> None:
 
 
 def decay_matrices_only(model: nn.Module, optimizer: th.optim.Optimizer) -> None:
-    """Biases, batch-norm parameters and the noise of noisy layers, which would die out, are spared."""
+    """Exempt biases, batch-norm parameters and the noise of noisy layers, which would vanish, from weight decay."""
     noise = {id(module.weight_sigma) for module in model.modules() if isinstance(module, NoisyLinear)}
     for group in list(optimizer.param_groups):
         if group.get("weight_decay"):

@@ -1,4 +1,4 @@
-"""What every EqR policy adds to an SB3 Q-learning policy."""
+"""The base class of all EqR policies, which extends SB3's Q-learning policies."""
 
 import inspect
 from collections.abc import Callable
@@ -44,57 +44,58 @@ OWN_ARGUMENTS += ["state_dependent_actions", "act_with_target", "reward_loss", "
 
 class EqRPolicy(BasePolicy):
     """
-    Mixin, to stand before an SB3 policy whose ``_build`` makes an online network, a target network and the optimiser.
-    It puts the group encoder behind the policy's features extractor, and adds the latent model, its target copy,
-    its parameter group and its train mode.
+    Mixin, listed before an SB3 policy whose ``_build`` creates an online network, a target network and the optimiser.
+    It adds the group encoder on top of the policy's features extractor, the latent model and its target copy, and includes
+    them in the optimiser and the train mode.
 
-    A subclass defines ``online`` and ``target``. The parameters up to ``optimizer_kwargs`` are those of SB3's policies.
+    Subclasses define ``online`` and ``target``. The parameters up to ``optimizer_kwargs`` are those of SB3's policies.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: hidden sizes of the Q head; ``None``: [256] (appendix B.4)
     :param activation_fn: Activation function of the Q head
-    :param features_extractor_class: the trunk; the group encoder is put behind it. Its class or its name: "nature" (the
+    :param features_extractor_class: the trunk, which the group encoder is put on top of. A class or a name: "nature" (the
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``), "mlp" (one layer of 256),
         "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
-    :param features_extractor_kwargs: its keyword arguments: those of
-        :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", of ``ImpalaExtractor`` beside it for "impala"
+    :param features_extractor_kwargs: keyword arguments of the trunk: those of
+        :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", those of
+        :class:`~sb3_eqr.common.networks.encoders.ImpalaExtractor` for "impala"
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
-    :param optimizer_kwargs: its keyword arguments, excluding the learning rate. The agent's constructor adds ``eps=1.5e-4``
-        (Table 5) and ``fused=True`` (one kernel for all parameters) for Adam and AdamW where they are not given.
-        ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452; AdamW's own default is 0.01) reaches matrices only,
-        not biases, batch-norm parameters and the noise of noisy layers
-    :param group: what the blocks of the state are elements of, see :func:`~sb3_eqr.common.groups.make_group`;
-        "none" for free vectors, ``None`` to take the trunk's features as they are (no encoder); both need ``symmetry_coef=0``
-    :param n_blocks: K; ``None``: 12, for T(n) 32 (Table 5), and 1 where the group's name counts its own blocks
-    :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
-    :param whiten: whether the encoder's algebra parameters are whitened over the batch: states cannot collapse to a point, and
-        blocks are driven apart; needs a group
-    :param layer_norm: whether layer norm stands behind the trunk, with a group and without
-    :param head_input: what the Q head sees: "state", the group elements (the paper), or "trunk", the trunk's features, from
-        which the latent model makes the group elements for itself; the AET loss then needs ``projection="own"`` or "none"
-    :param dueling: value and advantage streams
-    :param noisy: factorised noisy layers in the head
-    :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243), where Table 5 has 0.5
-    :param transition: how actions move states: "group", or "convolutional": SPR's network on the trunk's map of features
-        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), with ``group=None`` and an image trunk
+    :param optimizer_kwargs: its keyword arguments, excluding the learning rate. For Adam and AdamW, the agent's constructor
+        adds the defaults ``eps=1.5e-4`` (Table 5) and ``fused=True`` (one kernel for all parameters).
+        ``weight_decay`` (0.1 in BBF, https://arxiv.org/abs/2305.19452; AdamW's own default is 0.01) applies only to matrices,
+        not to biases, batch-norm parameters and the noise of noisy layers
+    :param group: group of the blocks of the latent state, see :func:`~sb3_eqr.common.groups.make_group`; "none" for
+        unconstrained vectors, ``None`` to use the trunk's features directly (no encoder); both need ``symmetry_coef=0``
+    :param n_blocks: K; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the group's name contains the number of blocks
+    :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
+    :param whiten: whether to whiten the encoder's algebra parameters over the batch: states cannot collapse to a point, and
+        blocks are decorrelated; needs a group
+    :param layer_norm: whether to apply layer norm to the trunk's features, with or without a group
+    :param head_input: input of the Q head: "state", the group elements (the paper), or "trunk", the trunk's features; only the
+        latent model then uses group elements, and the AET loss needs ``projection="own"`` or "none"
+    :param dueling: whether to use value and advantage streams
+    :param noisy: whether to use factorised noisy layers in the head
+    :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243); Table 5 uses 0.5
+    :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
+        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None`` and an image trunk
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
-    :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a layer of its own, or
+    :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or
         "none", the state itself (§5)
-    :param predictor: whether a linear layer stands behind p on the online side alone, as in SPR
-        (https://arxiv.org/abs/2007.05929): a target that is a copy then invites no collapse
-    :param latent_tau: how far the latent model's target (encoder, p̄, κ̄, b̄) moves after each gradient step, in [0, 1]; 1
-        copies, as in the paper. ``None``: it moves with the target of the Q head
-    :param state_dependent_actions: κ(s, a); ``False``: κ(a), as in Example 2, whatever the state
-    :param act_with_target: choose actions by the target network, which is steadier with ``tau`` < 1 (as SR-SPR,
-        https://openreview.net/forum?id=OpC-9aBBVJe, and BBF do); else by the online network
+    :param predictor: whether to add a linear layer after p on the online side only, as in SPR
+        (https://arxiv.org/abs/2007.05929), so that a target that is an exact copy does not favour a collapse
+    :param latent_tau: update coefficient of the latent model's target (encoder, p̄, κ̄, b̄) after each gradient step, in
+        [0, 1]; 1 copies, as in the paper. ``None``: it is updated together with the target of the Q head
+    :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), independent of the state, as in Example 2
+    :param act_with_target: whether to choose actions with the target network, which changes more slowly if ``tau`` < 1 (as in
+        SR-SPR, https://openreview.net/forum?id=OpC-9aBBVJe, and BBF), instead of the online network
     :param reward_loss: "mse" (Eq. 17), or "categorical": cross-entropy over the sign of the reward
     :param aet_loss: "distance" (Eq. 18), or "contrastive": InfoNCE among the batch's targets
         (:func:`~sb3_eqr.common.losses.contrastive_loss`), which cannot collapse
-    :param stock_kwargs: what else the stock policy takes
-    :raises ValueError: for an argument out of its range
+    :param stock_kwargs: additional arguments of the SB3 policy
+    :raises ValueError: if an argument is out of range
     """
 
     default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = MlpExtractor
@@ -106,7 +107,7 @@ class EqRPolicy(BasePolicy):
     own_projection: nn.Linear | None
     own_projection_target: nn.Linear | None
     latent_network_target: EqRNetwork | None
-    state_dim: int  # D: of what the latent model moves
+    state_dim: int  # D: size of the latent state
 
     def __init__(
         self,
@@ -148,9 +149,9 @@ class EqRPolicy(BasePolicy):
             check_names(f"policy_kwargs: {type(self).__name__}", stock_kwargs, sorted(names))
         check_arguments(given, POLICY)
         if whiten and group is None:
-            raise ValueError("whiten: expected a group, whose parameters are whitened, found group=None. Pass whiten=False.")
+            raise ValueError("group must not be None if whiten=True, got None. Pass a group, or whiten=False.")
         if transition == "convolutional" and group is not None:
-            raise ValueError(f'transition: expected group=None, whose features "convolutional" moves, found group={group!r}')
+            raise ValueError(f'group must be None if transition="convolutional", got {group!r}. Pass group=None.')
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
@@ -186,23 +187,23 @@ class EqRPolicy(BasePolicy):
 
     @property
     def online(self) -> EqRNetwork:
-        """The network that is trained, and acts unless ``act_with_target``."""
+        """The network that is trained, and that acts unless ``act_with_target``."""
         raise AttributeError(f"{type(self).__name__} must define `online`")
 
     @property
     def target(self) -> EqRNetwork:
-        """Its target copy."""
+        """The target copy of the online network."""
         raise AttributeError(f"{type(self).__name__} must define `target`")
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """The given features extractor as trunk, and the group encoder behind it where the Q head sees group elements."""
+        """Create the trunk, with the group encoder on top of it if the Q head takes group elements."""
         trunk_kwargs = dict(self.features_extractor_kwargs)
         if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
         is_encoder = issubclass(self.features_extractor_class, GroupFeaturesExtractor)
         if is_encoder and self.group is not None and self.head_input == "trunk":
             raise ValueError(
-                'features_extractor_class: expected a trunk, found a group encoder. Pass head_input="state" with it.'
+                'features_extractor_class must be a trunk if head_input="trunk", got a group encoder. Pass head_input="state".'
             )
         if self.group is None or self.head_input == "trunk":
             trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
@@ -223,7 +224,7 @@ class EqRPolicy(BasePolicy):
 
     @property
     def group_layer(self) -> GroupLayer | None:
-        """What makes group elements of features: in the encoder, or in the latent model; ``None`` without a group."""
+        """The layer that maps features to group elements, in the encoder or the latent model; ``None`` without a group."""
         for owner, name in ((self.online.features_extractor, "group_layer"), (self.latent_model, "embedding")):
             if isinstance(found := getattr(owner, name, None), GroupLayer):
                 return found
@@ -262,16 +263,16 @@ class EqRPolicy(BasePolicy):
             not any(isinstance(module, depend_on_mode) for part in parts for module in part.modules())
             for parts in ([encoder], [encoder, self.latent_model.embedding])
         )
-        is_online = self.latent_tau == 1 and self._states_ignore_mode  # a copy would have nothing of its own
+        is_online = self.latent_tau == 1 and self._states_ignore_mode  # a copy would be identical
         self.latent_network_target = None if self.latent_tau is None or is_online else _frozen_copy(self.online)
         self._make_target_copies()
-        # One optimiser: the learning-rate schedule and the save path are the inherited ones.
+        # One optimiser, so that SB3's learning-rate schedule and saving work unchanged.
         self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
         decay_matrices_only(self, self.optimizer)
 
     @property
     def description(self) -> dict[str, str]:
-        """What the shapes of parameters do not say, by name, in words that are saved in a model's file."""
+        """Properties that the parameters' shapes do not determine, by name; saved in the model's file."""
         return {"group": "no group" if self.group_layer is None else self.group_layer.description}
 
     def _make_latent_model(self, encoder: BaseFeaturesExtractor) -> LatentModel:
@@ -305,23 +306,23 @@ class EqRPolicy(BasePolicy):
 
     @property
     def latent_target(self) -> EqRNetwork:
-        """The network whose encoder gives the latent model its targets."""
+        """The network whose encoder computes the latent model's targets."""
         if self.latent_tau is None:
             return self.target
         return self.latent_network_target or self.online
 
     @property
     def target_encodes_as_online(self) -> bool:
-        """Whether features of the Q head's target are online features, so that one pass serves for both."""
+        """Whether the target encoder of the Q head gives the same features as the online one, so that one pass suffices."""
         return self.target_copy.is_exact and self._encoder_ignores_mode
 
     @property
     def latent_target_encodes_as_online(self) -> bool:
-        """The same of the latent model's target."""
+        """The same for the latent model's target."""
         return self.latent_target_copy.is_exact and self._states_ignore_mode
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """As PyTorch's, with the same parameters."""
+        """As PyTorch's ``load_state_dict``, with the same parameters."""
         result = super().load_state_dict(*args, **kwargs)
         for copy in (self.target_copy, self.latent_target_copy):
             copy.compare()
@@ -331,33 +332,32 @@ class EqRPolicy(BasePolicy):
         return (self.target if self.act_with_target else self.online)._predict(observation, deterministic)
 
     def check_losses(self, aet: bool, symmetry: bool) -> None:
-        """Raise ValueError if this policy cannot serve the AET or the GET (``symmetry``) loss that is asked for."""
+        """Raise ValueError if this policy does not support the requested AET or GET (``symmetry``) loss."""
         if symmetry and not self.latent_model.has_symmetry_loss:
             raise ValueError(
-                f"symmetry_coef: the GET loss needs a group with inverses, found group={self.group!r}. "
-                "Pass symmetry_coef=0 or another group."
+                f"group must have inverses for the GET loss, got {self.group!r}. Pass symmetry_coef=0 or another group."
             )
         if aet and self.projection == "head" and isinstance(self.latent_model.embedding, GroupLayer):
             raise ValueError(
-                'projection: expected "own" or "none" beside head_input="trunk", whose Q head takes no group elements; '
-                'found "head". Pass policy_kwargs={"projection": "own"}, or aet_coef=0.'
+                'projection must be "own" or "none" if head_input="trunk", because the Q head then takes no group elements, '
+                'got "head". Pass policy_kwargs={"projection": "own"}, or aet_coef=0.'
             )
         if aet and self.projection == "head" and not self.net_arch:
             raise ValueError(
-                "net_arch: expected at least one hidden layer, because the AET loss projects with the first one; found []. "
+                "net_arch must have at least one hidden layer, because the AET loss projects with the first one, got []. "
                 'Pass policy_kwargs={"net_arch": [256]} or {"projection": "own"}, or aet_coef=0.'
             )
 
     @property
     def project(self) -> Projection:
-        """p of the AET loss, and the predictor behind it."""
+        """p of the AET loss, followed by the predictor if there is one."""
         project = self._projections(self.online, self.own_projection)
         predict = self.predictor_net
         return project if predict is None else lambda rows: predict(project(rows))
 
     @property
     def target_project(self) -> Projection:
-        """p̄, from the target copy."""
+        """p̄, the target copy of p."""
         return self._projections(self.latent_target, self.own_projection_target)
 
     def _projections(self, network: EqRNetwork, own: nn.Linear | None) -> Projection:
@@ -366,23 +366,24 @@ class EqRPolicy(BasePolicy):
         return network.head.project if self.projection == "head" else nn.Identity()
 
     def update_target(self, tau: float) -> None:
-        """Move the target (encoder and Q head, and the latent model's unless it has a ``latent_tau``); 1 copies."""
+        """Update the targets of encoder and Q head, and of the latent model if ``latent_tau`` is ``None``; 1 copies."""
         self.target_copy.update(tau)
 
     def after_gradient_step(self) -> None:
-        """The online networks have changed: targets that are copies are none any more, and the latent model's moves."""
+        """Note that the targets are no longer exact copies, and update the latent model's target."""
         self.target_copy.is_exact = self.latent_target_copy.is_exact = False
         if self.latent_tau is not None:
             self.latent_target_copy.update(self.latent_tau)
 
     def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """
-        Against lost plasticity: the Q head (and the AET loss's own projection) is drawn afresh (Nikishin et al. 2022,
-        https://arxiv.org/abs/2205.07802); encoder and latent model become α old + (1 - α) fresh (shrink and perturb, Ash
-        and Adams 2020, https://arxiv.org/abs/1910.08475; for the encoder in SR-SPR and BBF). Batch statistics stay. The
-        optimiser forgets its state, and the target copy becomes one of the new parameters. What is frozen stays.
+        Reset parameters to counter the loss of plasticity: reinitialise the Q head and the AET loss's own projection
+        (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802), and set encoder and latent model to α old + (1 - α) fresh
+        (shrink and perturb, Ash and Adams 2020, https://arxiv.org/abs/1910.08475; used for the encoder in SR-SPR and BBF).
+        Batch statistics and frozen parameters are kept. The optimiser's state is cleared, and the target copies the new
+        parameters.
 
-        :param fresh: a policy of the same kind, just built
+        :param fresh: a newly initialised policy of the same kind
         :param shrink_factor: α in [0, 1]
         """
         parts: list[tuple[nn.Module | None, nn.Module | None, float]] = [
@@ -409,16 +410,16 @@ class EqRPolicy(BasePolicy):
         return super()._apply(fn, recurse)
 
     def set_training_mode(self, mode: bool) -> None:
-        """Put everything that is trained into train or eval mode; the target copy stays in eval mode."""
+        """Put all trained modules into train or eval mode; the target copies stay in eval mode."""
         if mode == self.training:
-            return  # SB3 asks at every step of an environment, and going through all modules takes a while
+            return  # SB3 calls this at every environment step, and visiting all modules is slow
         super().set_training_mode(mode)
         self.latent_model.train(mode)
         for module in self._frozen:
             module.eval()
 
     def freeze(self, modules: list[nn.Module]) -> None:
-        """Leave parts of this policy as they are from now on, parameters and batch statistics; earlier ones are released."""
+        """Freeze the parameters and batch statistics of these modules, and unfreeze all others."""
         for module in self._frozen:
             module.requires_grad_(True).train(self.training)
         for module in modules:
@@ -430,18 +431,18 @@ class EqRPolicy(BasePolicy):
 
 
 def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
-    """(C, H, W) of the features that a convolutional transition moves; raises ValueError if they are no map."""
+    """Shape (C, H, W) of the feature map for a convolutional transition; raises ValueError if features are not a map."""
     trunk = encoder.trunk if isinstance(encoder, NormalizedExtractor) else encoder
     if not isinstance(trunk, ImageExtractor) or trunk.linear is not None:
         raise ValueError(
-            f'transition: "convolutional" expected an image trunk without a linear layer, found {type(trunk).__name__}. '
-            'Pass features_extractor_class="nature" or "impala" without features_dim.'
+            'features_extractor_class must be an image trunk without a linear layer if transition="convolutional", '
+            f'got {type(trunk).__name__}. Pass features_extractor_class="nature" or "impala" without features_dim.'
         )
     return trunk.map_shape
 
 
 def _frozen_copy(module: Module) -> Module:
-    """A copy in eval mode without trained parameters. Parts that no target needs (r_ψ, ρ) are left out."""
+    """A copy in eval mode whose parameters are not trained. Omits modules that targets do not need (r_ψ, ρ)."""
     copy = deepcopy(module)
     if isinstance(copy, LatentModel):
         del copy.reward_net

@@ -1,4 +1,4 @@
-"""The latent networks, each with one hidden layer and batch norm, and states that they move one after the other (Eq. 10)."""
+"""The latent networks, with one hidden layer and batch norm, and the latent rollout, which applies κ repeatedly (Eq. 10)."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from sb3_eqr.common.groups import Group
 
 class HiddenLayer(nn.Sequential):
     """
-    Linear layer, batch norm, ReLU, linear layer: κ, r_ψ and ρ alike (appendix B.4).
+    Linear layer, batch norm, ReLU, linear layer: the architecture of κ, r_ψ and ρ (appendix B.4).
 
     :param n_in: size of the input
     :param n_hidden: H
@@ -23,14 +23,14 @@ class HiddenLayer(nn.Sequential):
         super().__init__(nn.Linear(n_in, n_hidden), nn.BatchNorm1d(n_hidden), nn.ReLU(), nn.Linear(n_hidden, n_out))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """(B, n_in) to (B, n_out)."""
+        """Map (B, n_in) to (B, n_out)."""
         first, norm, _, last = self
         weights = first.weight, first.bias, norm.weight, norm.bias, last.weight, last.bias
         return _HiddenLayer.apply(inputs, *weights, norm)
 
 
 def _activate(before: th.Tensor, norm: nn.BatchNorm1d) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-    """Batch norm and ReLU of (B, H), without a graph, and what :func:`_activate_backward` needs."""
+    """Batch norm and ReLU of (B, H), without an autograd graph, and the tensors that :func:`_activate_backward` needs."""
     statistics: Any = norm.running_mean, norm.running_var, norm.training, norm.momentum, norm.eps
     normed, mean, inverse_deviation = th.native_batch_norm(before, norm.weight, norm.bias, *statistics)
     hidden = normed.relu_()
@@ -38,7 +38,7 @@ def _activate(before: th.Tensor, norm: nn.BatchNorm1d) -> tuple[th.Tensor, tuple
 
 
 def _activate_backward(gradient: th.Tensor, saved: tuple[th.Tensor, ...], norm: nn.BatchNorm1d) -> tuple[th.Tensor, ...]:
-    """From the gradient of :func:`_activate`'s result to those of its argument, (B, H), and of scale and shift, (H,)."""
+    """The gradients of :func:`_activate`'s input, (B, H), and of scale and shift, (H,), from the gradient of its result."""
     before, hidden, scale, *moments = saved
     of_normed = th.ops.aten.threshold_backward(gradient, hidden, 0)
     statistics = norm.running_mean, norm.running_var, *moments, norm.training, norm.eps
@@ -46,7 +46,7 @@ def _activate_backward(gradient: th.Tensor, saved: tuple[th.Tensor, ...], norm: 
 
 
 class _HiddenLayer(th.autograd.Function):
-    """:class:`HiddenLayer` as one node: PyTorch needs half as many operations as for the gradients of its modules."""
+    """:class:`HiddenLayer` as one autograd node, which halves the number of operations of the backward pass."""
 
     @staticmethod
     def forward(
@@ -80,23 +80,23 @@ def rollout(group: Group, state: th.Tensor, actions: th.Tensor, transition: Hidd
     """
     x̂_m = κ(x̂_{m−1}, a_{t+m−1}) · x̂_{m−1}.
 
-    :param group: of the K blocks
+    :param group: group of the K blocks
     :param state: x₀, (B, D)
     :param actions: a_t ... a_{t+M-1}, int64, (B, M)
-    :param transition: κ, from state and one-hot action, D + A numbers, to parameters of K elements
+    :param transition: κ, which maps state and one-hot action, D + A numbers, to the parameters of K elements
     :return: x̂_1 ... x̂_M, (B, M, D)
     """
     layers: Any = transition
     first, norm, _, last = layers
     weight, of_actions = first.weight.split([state.shape[1], first.in_features - state.shape[1]], dim=1)
-    offsets = F.embedding(actions.mT, of_actions.mT) + first.bias  # (M, B, H): what actions add, for all steps at once
+    offsets = F.embedding(actions.mT, of_actions.mT) + first.bias  # (M, B, H): contribution of the actions, for all steps
     return _Rollout.apply(state, offsets, weight, norm.weight, norm.bias, last.weight, last.bias, group, norm)
 
 
 class _Rollout(th.autograd.Function):
     """
-    The steps, each of which needs the one before. Its gradient by hand: only that of the states has to go back step by step;
-    those of the weights are one product over all steps each.
+    The sequential steps of the rollout, with a hand-written gradient: only the gradient of the states is computed step by
+    step; each weight gradient is one product over all steps.
     """
 
     @staticmethod

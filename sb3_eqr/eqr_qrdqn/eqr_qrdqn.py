@@ -11,13 +11,13 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     """
     Equivariant representations for RL (EqR) on Quantile Regression DQN.
     Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
-    the quantile head is of https://arxiv.org/abs/1710.10044.
+    the quantile head is from https://arxiv.org/abs/1710.10044.
 
-    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRQRDQN.__init__)``), with
-    the values of the paper for Atari 100K (Table 5) as defaults. They deviate where QR-DQN does: 51 quantiles stand in
-    for 51 atoms on [-10, 10], and the priority of a sample is its quantile loss.
+    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRQRDQN.__init__)``). The
+    defaults are the paper's values for Atari 100K (Table 5), except where QR-DQN differs: 51 quantiles replace the 51 atoms
+    on [-10, 10], and the priority of a sample is its quantile loss.
 
-    Group, number of blocks, dueling and noisy layers are set by ``policy_kwargs``, see
+    ``policy_kwargs`` sets the group, the number of blocks, dueling and noisy layers, see
     :class:`~sb3_eqr.eqr_qrdqn.policies.EqRQRDQNPolicy`.
     """
 

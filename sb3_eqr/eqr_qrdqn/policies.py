@@ -1,4 +1,4 @@
-"""Policies of EqRQRDQN: those of ``sb3_contrib.QRDQN`` with a group encoder, a dueling noisy head and a latent model."""
+"""Policies of EqRQRDQN: ``sb3_contrib.QRDQN``'s policies with a group encoder, a dueling noisy head and a latent model."""
 
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ from sb3_eqr.common.policies import EqRPolicy
 
 
 class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
-    """Features extractor and quantile head. For the parameters see :class:`~sb3_eqr.common.networks.q_networks.EqRNetwork`."""
+    """Features extractor and quantile head. See :class:`~sb3_eqr.common.networks.q_networks.EqRNetwork` for the parameters."""
 
     def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
         """
@@ -37,7 +37,7 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
     def td_loss(
         self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """The quantile Huber loss; it is also the priority."""
+        """The quantile Huber loss, which is also the priority."""
         loss = quantile_huber_loss(current, rewards + discounts * following)
         return loss, loss.detach()
 
@@ -49,9 +49,9 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
-    :param n_quantiles: number of quantiles; Table 5's support has 51
+    :param n_quantiles: number of quantiles; the support in Table 5 has 51 atoms
     :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
-    :raises ValueError: for an argument out of its range
+    :raises ValueError: if an argument is out of range
     """
 
     quantile_net: EqRQuantileNetwork

@@ -15,15 +15,15 @@ class EqRRainbow(EqRAlgorithm, DQN):
     """
     Equivariant representations for RL (EqR) on a Rainbow-style categorical agent: the agent of the paper.
     Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
-    the categorical head (C51) is of https://arxiv.org/abs/1707.06887, its combination with double Q, dueling, noisy
-    layers, prioritised replay and n-step returns of https://arxiv.org/abs/1710.02298.
+    the categorical head (C51) is from https://arxiv.org/abs/1707.06887, its combination with double Q, dueling, noisy
+    layers, prioritised replay and n-step returns from https://arxiv.org/abs/1710.02298.
 
-    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRRainbow.__init__)``), with
-    the values of the paper for Atari 100K (Table 5) as defaults.
+    The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRRainbow.__init__)``). The
+    defaults are the paper's values for Atari 100K (Table 5).
 
-    The support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), group, number of blocks, dueling and noisy
-    layers are set by ``policy_kwargs``, see :class:`~sb3_eqr.eqr_rainbow.policies.EqRRainbowPolicy`. The default support
-    is for rewards clipped to [-1, 1]; returns beyond it are warned of.
+    ``policy_kwargs`` sets the support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), the group, the number
+    of blocks, dueling and noisy layers, see :class:`~sb3_eqr.eqr_rainbow.policies.EqRRainbowPolicy`. The default support
+    is for rewards clipped to [-1, 1]; the agent warns if a return lies outside the support.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -39,7 +39,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     _warned_of_returns = False
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        self._episode_rewards: list[list[float]] = [[] for _ in range(self.n_envs)]  # so far
+        self._episode_rewards: list[list[float]] = [[] for _ in range(self.n_envs)]  # of the current episodes
         return super()._setup_learn(*args, **kwargs)
 
     def _store_transition(
@@ -52,15 +52,15 @@ class EqRRainbow(EqRAlgorithm, DQN):
         infos: list[dict[str, Any]],
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        settled = self._vec_normalize_env is None or self.num_timesteps > self.learning_starts  # its scale moves at first
+        settled = self._vec_normalize_env is None or self.num_timesteps > self.learning_starts  # its scale varies at first
         if settled and not self._warned_of_returns:
             self._watch_returns(reward, dones)
 
     def _watch_returns(self, reward: np.ndarray, dones: np.ndarray) -> None:
         """
-        Warn, once, of a reward or of the discounted rewards to the end of an episode that the support cannot hold.
+        Warn, once, about a reward or a discounted return to the end of an episode that lies outside the support.
 
-        :param reward: as the agent learns from it, (n_envs,)
+        :param reward: the rewards that the agent learns from, (n_envs,)
         :param dones: (n_envs,)
         """
         returns = list(reward)
@@ -74,10 +74,10 @@ class EqRRainbow(EqRAlgorithm, DQN):
         if not v_min <= worst <= v_max:
             self._warned_of_returns = True
             warnings.warn(
-                f"step {self.num_timesteps}: a discounted return of {worst:.4g} was seen, but the agent's return distribution "
-                f"ends at [v_min, v_max] = [{v_min}, {v_max}]: it cannot tell such returns apart. "
-                "Pass policy_kwargs=dict(v_min=..., v_max=...): a step's least and largest reward over 1 - gamma hold "
-                "them all. Or scale the rewards (VecNormalize)."
+                f"step {self.num_timesteps}: a discounted return of {worst:.4g} lies outside the support of the return "
+                f"distribution, [v_min, v_max] = [{v_min}, {v_max}], and is clipped to it. "
+                "Pass policy_kwargs=dict(v_min=..., v_max=...), for example the smallest and largest reward of a step divided "
+                "by 1 - gamma, or scale the rewards (VecNormalize)."
             )
 
     def _excluded_save_params(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""Policies of EqRRainbow: those of SB3's DQN with a group encoder, a dueling noisy categorical head and a latent model."""
+"""Policies of EqRRainbow: SB3's DQN policies with a group encoder, a dueling noisy categorical head and a latent model."""
 
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from sb3_eqr.common.policies import EqRPolicy
 
 class EqRCategoricalNetwork(EqRNetwork, QNetwork):
     """
-    Features extractor and categorical head: the probabilities of N evenly spaced returns, per action (C51).
+    Features extractor and categorical head: for each action, the probabilities of N evenly spaced returns (C51).
 
     :param v_min: the lowest return
     :param v_max: the highest return
@@ -55,7 +55,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
     def td_loss(
         self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """The cross-entropy with the projected target distribution; the priority is their KL divergence."""
+        """The cross-entropy with the projected target distribution; the priority is the KL divergence between the two."""
         with th.no_grad():
             values = th.addcmul(rewards, discounts, self.support)  # (B, N)
             target = categorical_projection(values, following.softmax(dim=1), self.v_min, self.v_max)
@@ -74,9 +74,9 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     :param lr_schedule: Learning rate schedule (could be constant)
     :param n_atoms: number of atoms of the return distribution, ≥ 2; 51 in Table 5
     :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017)
-    :param v_max: the highest return, > ``v_min``; 10
+    :param v_max: the highest return, > ``v_min``; 10 for rewards clipped to [-1, 1]
     :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
-    :raises ValueError: for an argument out of its range
+    :raises ValueError: if an argument is out of range
     """
 
     q_net: EqRCategoricalNetwork
@@ -94,9 +94,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     ):
         check_arguments({"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max}, POLICY)
         if v_min >= v_max:
-            raise ValueError(
-                f"v_min: expected a number below v_max = {v_max}, found {v_min}. Pass the lowest possible return."
-            )
+            raise ValueError(f"v_min must be a finite number < v_max = {v_max}, got {v_min}. Pass the lowest possible return.")
         self.n_atoms = n_atoms
         self.v_min = v_min
         self.v_max = v_max
@@ -112,7 +110,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
 
     @property
     def description(self) -> dict[str, str]:
-        return {**super().description, "support": f"[{float(self.v_min)}, {float(self.v_max)}]"}  # of the logits
+        return {**super().description, "support": f"[{float(self.v_min)}, {float(self.v_max)}]"}
 
     def make_q_net(self) -> EqRCategoricalNetwork:
         return self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)

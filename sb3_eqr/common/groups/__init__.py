@@ -1,10 +1,10 @@
 """
-Matrix Lie groups: what states and actions are made of (EqR, §3.1, §4 and appendix A).
+Matrix Lie groups, which represent latent states and actions (EqR, §3.1, §4 and appendix A).
 
-A network predicts ``num_params`` numbers per block; :meth:`Group.element` turns them into a group element.
-Every method is stateless, differentiable and batched over all leading dimensions.
+A network predicts ``num_params`` numbers per block, and :meth:`Group.element` turns them into a group element.
+All methods are stateless, differentiable and batched over all leading dimensions.
 
-``base`` says what a group is, ``matrix`` has the formulas, ``product`` makes groups from names.
+``base`` defines the interface, ``matrix`` the groups, and ``product`` creates groups from their names.
 """
 
 from sb3_eqr.common.groups.base import Group

@@ -1,4 +1,4 @@
-"""What every group offers to encoder and latent model (EqR, §3.1 and §4)."""
+"""The interface of all groups, used by the encoder and the latent model (EqR, §3.1 and §4)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,9 +12,9 @@ class Group(ABC):
     """
     A group whose elements are arrays of one shape.
 
-    ``num_params``: how many numbers the network predicts per element.
-    ``element_shape``: the shape of one element.
-    ``has_inverse``: False only where the "group" is none (see :class:`NoGroup`).
+    ``num_params``: number of parameters that the network predicts per element.
+    ``element_shape``: shape of one element.
+    ``has_inverse``: ``False`` only for :class:`NoGroup`, which is not a group.
     """
 
     num_params: int
@@ -32,6 +32,8 @@ class Group(ABC):
     @abstractmethod
     def element(self, params: th.Tensor) -> th.Tensor:
         """
+        Compute group elements from their parameters.
+
         :param params: real numbers, (..., num_params), floating point
         :return: group elements, (..., \\*element_shape), same dtype and device
         """
@@ -39,7 +41,7 @@ class Group(ABC):
     @abstractmethod
     def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
         """
-        The group's operation; the left factor acts on the right one (Eq. 10).
+        The group operation; the left factor acts on the right one (Eq. 10).
 
         :param left: (..., \\*element_shape)
         :param right: (..., \\*element_shape), broadcast against ``left``
@@ -48,11 +50,13 @@ class Group(ABC):
 
     def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
         """
-        ``compose(element(params), right)``, and its vector-Jacobian product: from the gradient of the result to those of
-        ``params`` and ``right``. Here by autograd; a group may know both in closed form. For use under ``no_grad``.
+        Compute ``compose(element(params), right)`` and its vector-Jacobian product, which maps the gradient of the result to
+        the gradients of ``params`` and ``right``. This default uses autograd; groups with a closed form override it. Call it
+        under ``no_grad``.
 
         :param params: (..., num_params)
         :param right: (..., \\*element_shape), with the same leading dimensions
+        :return: the result, and the function from its gradient to the two gradients
         """
         with th.enable_grad():
             inputs = params.detach().requires_grad_(), right.detach().requires_grad_()
@@ -62,8 +66,10 @@ class Group(ABC):
     @abstractmethod
     def inverse(self, element: th.Tensor) -> th.Tensor:
         """
+        Invert group elements.
+
         :param element: (..., \\*element_shape)
-        :return: (..., \\*element_shape); finite also where a GL element is singular
+        :return: (..., \\*element_shape); finite even if a GL element is singular
         """
 
     @abstractmethod
@@ -73,8 +79,9 @@ class Group(ABC):
     @property
     def for_actions(self) -> "Group":
         """
-        The same group with the parameters that actions are predicted in: small numbers are small moves there. States have
-        to cover the whole group, which "gram-schmidt" does without a seam; an action only has to leave the identity.
+        The same group in the parameterization used for actions, in which small parameters are small moves. Latent states
+        have to cover the entire group, which "gram-schmidt" does without a discontinuity; actions only have to cover a
+        neighbourhood of the identity.
         """
         return self
 

@@ -1,4 +1,4 @@
-"""Rotations, the groups of Table 1, and those given by generators of their algebra (EqR, §3.1 and appendix A)."""
+"""Rotations, the groups of Table 1, and groups given by generators of their Lie algebra (EqR, §3.1 and appendix A)."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :param angles: radians, (..., n(n-1)/2)
     :return: (..., n, n)
     """
-    if n == 2:  # one plane: there is nothing to multiply
+    if n == 2:  # one plane: no product needed
         return _PlaneRotation.apply(angles) if th.is_grad_enabled() else _plane_rotation(angles)
     cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # (..., planes, 1)
     columns = list(th.eye(n, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], n, n).unbind(-1))
@@ -31,15 +31,16 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
 
 
 def _plane_rotation(angles: th.Tensor) -> th.Tensor:
-    """R(θ) of angles, (..., 1): (..., 2, 2)."""
+    """R(θ), (..., 2, 2), from angles, (..., 1)."""
     cos, sin = angles.cos(), angles.sin()
     return th.cat([cos, sin, -sin, cos], dim=-1).view(*angles.shape[:-1], 2, 2)
 
 
 def _rotate_plane(angles: th.Tensor, columns: th.Tensor) -> tuple[th.Tensor, Gradients]:
     """
-    R(θ) S of angles, (..., 1), and columns S, (..., 2, n), with the same leading dimensions: (..., 2, n), and its
-    vector-Jacobian product. The derivative of R(θ) = exp(θE) is E R(θ): a third of the operations that its entries take.
+    R(θ) S, (..., 2, n), from angles, (..., 1), and columns S, (..., 2, n), with the same leading dimensions, and its
+    vector-Jacobian product. The derivative of R(θ) = exp(θE) is E R(θ), which takes a third of the operations needed to
+    differentiate each entry.
     """
     rotation = _plane_rotation(angles)
     rotated = rotation @ columns
@@ -48,12 +49,12 @@ def _rotate_plane(angles: th.Tensor, columns: th.Tensor) -> tuple[th.Tensor, Gra
 
 
 def _turned(rotated: th.Tensor) -> th.Tensor:
-    """The derivative of R(θ) S by θ: E R(θ) S, (..., 2, n)."""
+    """The derivative of R(θ) S with respect to θ: E R(θ) S, (..., 2, n)."""
     return _skew_basis(2, rotated.dtype, rotated.device) @ rotated
 
 
 def _gradient_of_angles(gradient: th.Tensor, turned: th.Tensor) -> th.Tensor:
-    """From the gradient of R(θ) S and its derivative, (..., 2, n) each, to that of θ, (..., 1)."""
+    """The gradient of θ, (..., 1), from the gradient of R(θ) S and its derivative, (..., 2, n) each."""
     return (gradient * turned).sum(dim=(-2, -1))[..., None]
 
 
@@ -76,7 +77,7 @@ class _PlaneRotation(th.autograd.Function):
 def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     """
     R = exp(Σ β_ij E^{ij}) over the skew-symmetric basis with E_ij = 1, E_ji = -1 (Eq. 13 and the SO(2) example
-    of appendix A.2; the sign for which it equals the Euler form on SO(2)).
+    of appendix A.2; this sign makes it equal to the Euler form on SO(2)).
 
     :param angles: radians, (..., n(n-1)/2)
     :return: (..., n, n)
@@ -86,7 +87,7 @@ def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
 
 @cache
 def _skew_basis(n: int, dtype: th.dtype, device: th.device) -> th.Tensor:
-    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+    with th.inference_mode(False):  # the cached tensor must also work in training, even if first used for inference
         basis = th.zeros(n * (n - 1) // 2, n, n, dtype=dtype)
         for d, (i, j) in enumerate(_planes(n)):
             basis[d, i, j], basis[d, j, i] = 1.0, -1.0
@@ -99,17 +100,17 @@ def _planes(n: int) -> list[tuple[int, int]]:
 
 def gram_schmidt_rotation(params: th.Tensor, n: int) -> th.Tensor:
     """
-    The n − 1 first columns are predicted whole and made orthonormal one after another, the last one completes a rotation
-    (Zhou et al. 2019, §4, https://arxiv.org/abs/1812.07035). Unlike angles, these numbers need not jump where a state comes
-    round to where it was: a continuous map from a loop to the real line cannot wind around a circle.
+    The network predicts the first n − 1 columns, which are orthonormalised one after another; the last column completes the
+    rotation (Zhou et al. 2019, §4, https://arxiv.org/abs/1812.07035). Unlike angles, these parameters need not jump when a
+    state returns to its start: a continuous map from a loop to the real line cannot wind around a circle.
 
-    :param params: the columns one by one, (..., n(n-1)); all 0 is the identity. A column that depends on those before it gives
-        way to the axis that depends on them least
+    :param params: the columns one by one, (..., n(n-1)); all 0 is the identity. A column that is linearly dependent on the
+        previous ones is replaced by the axis that depends on them least
     :return: (..., n, n)
     """
     found = params.new_empty(*params.shape[:-1], n, 0)  # (..., n, columns so far)
     for raw in params.unflatten(-1, (n - 1, n)).unbind(-2):
-        column = _without(found, _without(found, raw))  # twice: once leaves rounding errors as large as what is left
+        column = _without(found, _without(found, raw))  # twice: once may leave rounding errors as large as the remainder
         dependent = column.norm(dim=-1) <= n * _ROUNDING * th.finfo(params.dtype).eps * raw.detach().norm(dim=-1)
         column = th.where(dependent[..., None], _free_axis(found), column)
         found = th.cat([found, F.normalize(column, dim=-1)[..., None]], dim=-1)
@@ -118,23 +119,23 @@ def gram_schmidt_rotation(params: th.Tensor, n: int) -> th.Tensor:
     return th.cat([found, orientation * last], dim=-1)
 
 
-_ROUNDING = 10.0  # machine epsilons that two rounds of subtracting may leave of a column of length 1
+_ROUNDING = 10.0  # machine epsilons that may remain of a column of length 1 after subtracting twice
 
 
 def _without(columns: th.Tensor, vector: th.Tensor) -> th.Tensor:
-    """What of a vector, (..., n), is orthogonal to orthonormal columns, (..., n, k)."""
+    """The component of a vector, (..., n), orthogonal to orthonormal columns, (..., n, k)."""
     return vector - (columns @ (columns.mT @ vector[..., None])).squeeze(-1)
 
 
 def _free_axis(columns: th.Tensor) -> th.Tensor:
-    """Of the axes the one with the longest part orthogonal to orthonormal columns, (..., n, k): that part, (..., n)."""
+    """The longest component, (..., n), of a coordinate axis orthogonal to orthonormal columns, (..., n, k)."""
     eye = th.eye(columns.shape[-2], dtype=columns.dtype, device=columns.device)
-    free = eye - columns @ columns.mT  # (..., n, n): its columns are those parts, its diagonal their squared lengths
+    free = eye - columns @ columns.mT  # (..., n, n): its columns are these components, its diagonal their squared lengths
     longest = free.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1)  # (...)
     return (free @ eye[longest][..., None]).squeeze(-1)
 
 
-# name -> (how many numbers make a rotation of n-space, the rotation that they make)
+# name -> (number of parameters of a rotation in n dimensions, function from parameters to the rotation)
 ROTATIONS: dict[str, tuple[Callable[[int], int], Callable[[th.Tensor, int], th.Tensor]]] = {
     "euler": (lambda n: n * (n - 1) // 2, euler_rotation),
     "exp": (lambda n: n * (n - 1) // 2, exp_rotation),
@@ -144,12 +145,12 @@ ROTATIONS: dict[str, tuple[Callable[[int], int], Callable[[th.Tensor, int], th.T
 
 class MatrixGroup(Group):
     """
-    Matrices under multiplication; the base of GL, SE, SO and of groups given by generators.
+    Matrices under multiplication; base class of GL, SE, SO and groups given by generators.
 
-    :param name: of the group
-    :param num_params: numbers per element
-    :param size: m of the m×m matrices
-    :param is_affine: whether every matrix has the last row 0 ... 0 1. An element leaves it out: it never moves
+    :param name: name of the group
+    :param num_params: number of parameters per element
+    :param size: m, for m×m matrices
+    :param is_affine: whether the last row of every matrix is 0 ... 0 1. Elements omit this constant row
     """
 
     def __init__(self, name: str, num_params: int, size: int, is_affine: bool = False):
@@ -157,7 +158,7 @@ class MatrixGroup(Group):
         self.is_affine = is_affine
 
     def matrix(self, element: th.Tensor) -> th.Tensor:
-        """The matrices of elements, (..., *element_shape): (..., m, m)."""
+        """The matrices, (..., m, m), of elements, (..., *element_shape)."""
         if not self.is_affine:
             return element
         m = element.shape[-1]
@@ -176,19 +177,19 @@ class MatrixGroup(Group):
 
 @cache
 def _bottom_row(m: int, dtype: th.dtype, device: th.device) -> th.Tensor:
-    with th.inference_mode(False):  # whoever calls first, it serves in training, too
+    with th.inference_mode(False):  # the cached tensor must also work in training, even if first used for inference
         return th.eye(m, dtype=dtype)[-1:].to(device)
 
 
-# An inverse is replaced by its damped form where the condition number exceeds the inverse of this many
-# machine epsilons: beyond it, a plain solve has no correct digit left.
+# The damped inverse replaces the plain one if the condition number exceeds the reciprocal of this many machine epsilons:
+# beyond that, a plain solve has no correct digits left.
 _SINGULAR_EPS = 10.0
 
 
 def guarded_inverse(matrix: th.Tensor) -> th.Tensor:
     """
-    The inverse where there is one; where the matrix is singular to machine precision, the damped inverse
-    (AᵀA + ε‖A‖² I)⁻¹ Aᵀ of Tikhonov, which is always finite. No exception, no data-dependent shape.
+    The inverse, or, for a matrix that is singular to machine precision, Tikhonov's damped inverse
+    (AᵀA + ε‖A‖² I)⁻¹ Aᵀ, which is always finite. Raises no exception and has no data-dependent shapes.
 
     :param matrix: square matrices, (..., n, n), finite
     :return: (..., n, n)
@@ -200,7 +201,7 @@ def guarded_inverse(matrix: th.Tensor) -> th.Tensor:
         norms = th.linalg.matrix_norm(matrix) * th.linalg.matrix_norm(plain)
         singular = ~(norms < 1 / (_SINGULAR_EPS * eps))  # a NaN counts as singular
     singular = singular[..., None, None]
-    # Each branch sees only the matrices that it can handle, so that neither puts a NaN into the other's gradient.
+    # Each branch gets only matrices that it can handle, so that neither produces a NaN in the other's gradient.
     regular_inverse, _ = th.linalg.inv_ex(th.where(singular, eye, matrix))
     to_damp = th.where(singular, matrix, eye)
     gram = to_damp.mT @ to_damp  # (..., n, n)
@@ -211,7 +212,7 @@ def guarded_inverse(matrix: th.Tensor) -> th.Tensor:
 
 
 class GL(MatrixGroup):
-    """General linear: n×n matrices, each entry predicted (almost every one is invertible, appendix A.2)."""
+    """General linear: n×n matrices whose entries are the parameters (almost all are invertible, appendix A.2)."""
 
     def __init__(self, n: int):
         super().__init__(f"GL({n})", n * n, n)
@@ -225,12 +226,12 @@ class GL(MatrixGroup):
 
 class _Rotations(MatrixGroup):
     """
-    What SO and SE share.
+    Base class of SO and SE.
 
     :param name: "SO" or "SE"
-    :param n: of n-space
-    :param parameterization: in ``ROTATIONS``
-    :param n_shifts: translations, 0 or n
+    :param n: dimension of the space
+    :param parameterization: a key of ``ROTATIONS``
+    :param n_shifts: number of translation parameters, 0 or n
     """
 
     def __init__(self, name: str, n: int, parameterization: str, n_shifts: int):
@@ -241,12 +242,12 @@ class _Rotations(MatrixGroup):
 
     @property
     def _turns_plane(self) -> bool:
-        """Whether R(θ) has a closed form of its own."""
+        """Whether the rotation is R(θ) in a plane, which has a closed form."""
         return self.n == 2 and self.parameterization != "gram-schmidt"
 
 
 class SO(_Rotations):
-    """Special orthogonal: rotations of n-space, n ≥ 2."""
+    """Special orthogonal: rotations in n dimensions, n ≥ 2."""
 
     def __init__(self, n: int, parameterization: str = "euler"):
         super().__init__("SO", n, parameterization, n_shifts=0)
@@ -267,8 +268,8 @@ class SO(_Rotations):
 
 class SE(_Rotations):
     """
-    Special Euclidean: [[R, t], [0, 1]], of which an element holds the entries that move, [R, t]. What makes R comes first
-    among the parameters, then t.
+    Special Euclidean: [[R, t], [0, 1]]. An element holds the entries that vary, [R, t]. The parameters of R come first, then
+    those of t.
     """
 
     def __init__(self, n: int, parameterization: str = "euler"):
@@ -321,8 +322,8 @@ class T(Group):
 
 class NoGroup(Group):
     """
-    No group at all: free n-vectors, and "composing" keeps the left factor, so that the transition network
-    predicts the next state itself. This is the MLP row of Table 3, and SPR's kind of model.
+    No group: unconstrained n-vectors. ``compose`` returns the left factor, so the transition network predicts the next
+    state directly. This is the MLP row of Table 3, and the kind of model that SPR uses.
     """
 
     has_inverse = False
@@ -337,10 +338,10 @@ class NoGroup(Group):
         return left.expand(th.broadcast_shapes(left.shape, right.shape))
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
-        raise ValueError('group "none" has no inverse, so it cannot serve the GET loss: set symmetry_coef=0 or choose a group')
+        raise ValueError('group must have inverses for the GET loss, got "none". Pass symmetry_coef=0 or another group.')
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
-        raise ValueError('group "none" has no identity: choose a group such as "SE(2)"')
+        raise ValueError('group must have an identity, got "none". Pass a group such as "SE(2)".')
 
     def identity_params(self) -> th.Tensor:
         return self.identity()
@@ -348,28 +349,28 @@ class NoGroup(Group):
 
 class MatrixLieGroup(MatrixGroup):
     """
-    Any matrix Lie group, given by a basis of its algebra: element = exp(Σ β_i E⁽ⁱ⁾) (Eq. 13).
+    Any matrix Lie group, given by a basis of its Lie algebra: element = exp(Σ β_i E⁽ⁱ⁾) (Eq. 13).
 
-    :param generators: the basis E⁽ⁱ⁾, (D, m, m), anything ``torch.as_tensor`` takes; finite, D ≥ 1, m ≥ 1
-    :raises ValueError: if the shape is another, an entry is not finite, or they depend on each other
+    :param generators: the basis E⁽ⁱ⁾, (D, m, m), anything ``torch.as_tensor`` accepts; finite, D ≥ 1, m ≥ 1
+    :raises ValueError: if the shape is wrong, an entry is not finite, or the matrices are linearly dependent
     """
 
     def __init__(self, generators: th.Tensor | Sequence):
         basis = th.as_tensor(generators, dtype=th.float64)
         if basis.ndim != 3 or basis.shape[1] != basis.shape[2] or 0 in basis.shape or not basis.isfinite().all():
             raise ValueError(
-                f"generators: expected D >= 1 finite square matrices, shape (D, m, m), found shape {tuple(basis.shape)}"
-                f"{'' if basis.isfinite().all() else ' with entries that are not finite'}"
+                f"generators must be D >= 1 finite square matrices of shape (D, m, m), got shape {tuple(basis.shape)}"
+                f"{'' if basis.isfinite().all() else ' with entries that are not finite'}."
             )
         if th.linalg.matrix_rank(basis.flatten(1)) < len(basis):
             raise ValueError(
-                f"generators: expected a basis, found {len(basis)} matrices that depend on each other. Leave out "
-                "those that are sums of others."
+                f"generators must be linearly independent, got {len(basis)} linearly dependent matrices. Leave out "
+                "those that are linear combinations of others."
             )
         self.generators = basis
-        checksum = zlib.crc32(basis.numpy().tobytes())  # two bases of one shape are two groups
+        checksum = zlib.crc32(basis.numpy().tobytes())  # distinguishes groups whose bases have the same shape
         d, m, _ = basis.shape
-        is_affine = m > 1 and not bool(basis[:, -1].any())  # exp(A) of a last row of 0 has the last row 0 ... 0 1
+        is_affine = m > 1 and not bool(basis[:, -1].any())  # if the last row of A is 0, that of exp(A) is 0 ... 0 1
         super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, m, is_affine)
         self._placed: dict[tuple[th.dtype, th.device], th.Tensor] = {}
 

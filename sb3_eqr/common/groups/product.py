@@ -1,4 +1,4 @@
-"""Different groups as one, and the one table from names to groups."""
+"""Products of different groups, and the table of group names."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -12,9 +12,9 @@ from sb3_eqr.common.groups.matrix import GL, ROTATIONS, SE, SO, NoGroup, T
 
 class ProductGroup(Group):
     """
-    Different groups side by side, as one flat vector: the first factor's blocks, then the second's, and so on.
+    The direct product of different groups, as one flat vector: the first factor's blocks, then the second's, and so on.
 
-    :param factors: pairs of a group and how many blocks of it
+    :param factors: pairs of a group and its number of blocks
     """
 
     def __init__(self, factors: Sequence[tuple[Group, int]]):
@@ -65,25 +65,26 @@ class ProductGroup(Group):
 
 _FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")
 _LEGAL = "GL(n), SE(n), T(n) with n >= 1, SO(n) with n >= 2, none or none(n), or a product such as 'SE(2)^8 x SO(3)^4'"
-NO_GROUP_SIZE = 512  # the width of SB3's NatureCNN, for "none" without a size
+NO_GROUP_SIZE = 512  # for "none" without a size: the features_dim of SB3's NatureCNN
 
 
 def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
     """
-    The one table from names to groups.
+    Create a group from its name.
 
-    :param group: "GL(n)", "SE(n)", "SO(n)", "T(n)", "none", a product such as "SE(2)^8 x SO(3)^4";
-        a :class:`Group` is returned as it is
-    :param parameterization: of rotations, in SO and SE: "euler" (product over planes, the default of the paper's
-        experiments), "exp" (matrix exponential) or "gram-schmidt" (orthonormalised columns, which have no seam)
-    :raises ValueError: for a name or size that is not legal; the message lists the legal ones
+    :param group: "GL(n)", "SE(n)", "SO(n)", "T(n)", "none", or a product such as "SE(2)^8 x SO(3)^4";
+        a :class:`Group` is returned unchanged
+    :param parameterization: parameterization of the rotations in SO and SE: "euler" (product over planes, the default in the
+        paper's experiments), "exp" (matrix exponential) or "gram-schmidt" (orthonormalised columns, without discontinuity)
+    :return: the group
+    :raises ValueError: if the name or size is invalid; the message lists the valid ones
     """
     if isinstance(group, Group):
         return group
     if not isinstance(group, str):
-        raise ValueError(f"group: expected {_LEGAL}; found {group!r}")
+        raise ValueError(f"group must be {_LEGAL}, got {group!r}.")
     if parameterization not in ROTATIONS:
-        raise ValueError(f"parameterization: expected one of {list(ROTATIONS)}, found {parameterization!r}")
+        raise ValueError(f"parameterization must be one of {list(ROTATIONS)}, got {parameterization!r}.")
     factors = [_make_factor(part, group, parameterization) for part in re.split(r"[x×]", group.replace(" ", ""))]
     if len(factors) == 1 and factors[0][1] is None:
         return factors[0][0]
@@ -93,10 +94,10 @@ def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
 def _make_factor(part: str, name: str, parameterization: str) -> tuple[Group, int | None]:
     match = _FACTOR.fullmatch(part)
     if match is None or (match[2] is None and match[1] != "none"):
-        raise ValueError(f"group: expected {_LEGAL}; found {name!r}")
+        raise ValueError(f"group must be {_LEGAL}, got {name!r}.")
     kind, n, count = match[1], int(match[2] or NO_GROUP_SIZE), int(match[3]) if match[3] else None
     if n < (2 if kind == "SO" else 1) or count == 0:
-        raise ValueError(f"group: expected {_LEGAL}; found {name!r}, whose n or number of blocks is too small")
+        raise ValueError(f"group must be {_LEGAL}, got {name!r}, whose n or number of blocks is too small.")
     makers: dict[str, Callable[[], Group]] = {
         "GL": lambda: GL(n),
         "SE": lambda: SE(n, parameterization),

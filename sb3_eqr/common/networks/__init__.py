@@ -1,4 +1,4 @@
 """
-Networks: ``layers`` has what PyTorch does not have, ``encoders`` turn observations into group elements, ``q_networks`` these
-into values of actions.
+Networks: ``layers`` contains layers that PyTorch lacks, ``encoders`` map observations to group elements, and ``q_networks``
+map these to Q values.
 """

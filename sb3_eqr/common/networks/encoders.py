@@ -1,4 +1,4 @@
-"""Features extractors: convolutional trunks, and the group encoder τ that stands behind a trunk."""
+"""Features extractors: convolutional trunks, and the group encoder τ on top of a trunk."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -25,13 +25,13 @@ NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and ap
 
 class ConvTrunk(nn.Sequential):
     """
-    Convolutions with a ReLU after each, flattened, without a linear layer.
+    Convolutions, each followed by a ReLU; the output is flattened, without a linear layer.
 
     :param in_channels: C
-    :param layers: (filters, kernel size, stride) of each; the default is the network of Mnih et al. 2015 (appendix B.4)
+    :param layers: (filters, kernel size, stride) of each convolution; by default those of Mnih et al. 2015 (appendix B.4)
     """
 
-    memory_format = th.channels_last  # the fastest for several convolutions on CPU, and no slower on GPU
+    memory_format = th.channels_last  # fastest for several convolutions on CPU, and not slower on GPU
 
     def __init__(self, in_channels: int, layers: Sequence[Sequence[int]] = NATURE_LAYERS):
         modules: list[nn.Module] = []
@@ -39,12 +39,12 @@ class ConvTrunk(nn.Sequential):
             modules += [nn.Conv2d(in_channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
             in_channels = filters
         super().__init__(*modules, nn.Flatten())
-        if len(layers) == 1:  # no other convolution reads its output, which has to be flattened in this order
+        if len(layers) == 1:  # its output is flattened directly, which needs the contiguous layout
             self.memory_format = th.contiguous_format
 
     @staticmethod
     def smallest_image(layers: Sequence[Sequence[int]] = NATURE_LAYERS) -> int:
-        """The height and width that leave one pixel after the last layer."""
+        """The height and width for which one pixel is left after the last layer."""
         size = 1
         for _, kernel_size, stride in reversed(layers):
             size = (size - 1) * stride + kernel_size
@@ -52,25 +52,25 @@ class ConvTrunk(nn.Sequential):
 
     def to_channels_last(self) -> None:
         """
-        Lay the weights out as :meth:`forward` computes, so that no call has to copy them. Not done from the start: the
-        orthogonal initialisation of stock PPO takes no other layout than PyTorch's.
+        Convert the weights to the memory format of :meth:`forward`, so that calls need not copy them. The constructor does not
+        do this, because the orthogonal initialisation of SB3's PPO requires PyTorch's default layout.
         """
         first = next(iter(self.parameters()), None)
-        if first is not None and first.shape[1] > 1:  # images of one channel have but one layout
+        if first is not None and first.shape[1] > 1:  # images with one channel have only one layout
             self.to(memory_format=self.memory_format)  # type: ignore[call-overload]
 
     def forward(self, images: th.Tensor) -> th.Tensor:
-        """Images, (B, C, H, W), floating point, to features, (B, trunk_dim)."""
+        """Map images, (B, C, H, W), floating point, to features, (B, trunk_dim)."""
         return super().forward(images.contiguous(memory_format=self.memory_format))
 
 
 class ImpalaTrunk(ConvTrunk):
     """
-    The residual network of IMPALA (Espeholt et al. 2018, Figure 3, https://arxiv.org/abs/1802.01561), flattened, without
-    a linear layer: three stages of a 3×3 convolution, a 3×3 max pooling with stride 2 and two residual blocks.
+    The residual network of IMPALA (Espeholt et al. 2018, Figure 3, https://arxiv.org/abs/1802.01561) with flattened output,
+    without a linear layer: three stages of a 3×3 convolution, a 3×3 max pooling with stride 2 and two residual blocks.
 
     :param in_channels: C
-    :param width_scale: multiplies the 16, 32 and 32 channels of the stages; BBF uses 4
+    :param width_scale: factor for the 16, 32 and 32 channels of the stages; BBF uses 4
     """
 
     def __init__(self, in_channels: int, width_scale: float = 1):
@@ -87,7 +87,7 @@ class ResidualBlock(nn.Module):
     """
     x + conv(ReLU(conv(ReLU(x)))), with 3×3 convolutions.
 
-    :param channels: of input and output
+    :param channels: number of input and output channels
     """
 
     def __init__(self, channels: int):
@@ -96,14 +96,14 @@ class ResidualBlock(nn.Module):
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, images: th.Tensor) -> th.Tensor:
-        """Images to images, (B, C, H, W)."""
+        """Map (B, C, H, W) to (B, C, H, W)."""
         return images + self.conv2(F.relu(self.conv1(F.relu(images)), inplace=True))
 
 
 def rescaled(features: th.Tensor) -> th.Tensor:
     """
-    Each sample's features shifted and scaled to [0, 1] (Schrittwieser et al. 2020,
-    https://arxiv.org/abs/1911.08265; SPR and BBF do so with their convolutions' output).
+    Shift and scale the features of each sample to [0, 1] (Schrittwieser et al. 2020,
+    https://arxiv.org/abs/1911.08265; SPR and BBF do this with the output of their convolutions).
 
     :param features: (B, D)
     :return: (B, D)
@@ -114,15 +114,15 @@ def rescaled(features: th.Tensor) -> th.Tensor:
 
 class ImageExtractor(BaseFeaturesExtractor):
     """
-    SB3 features extractor around a convolutional trunk.
+    SB3 features extractor with a convolutional trunk.
 
     :param observation_space: channels-first images
-    :param make_trunk: from the number of channels to the trunk
-    :param smallest: legal height and width
-    :param features_dim: size of a linear layer and its ReLU behind the convolutions; ``None``: no such layer
-    :param normalized_image: as in SB3's ``NatureCNN``: the images are floats already, skip the check for uint8
-    :param rescale: whether the convolutions' output is scaled to [0, 1] per sample, as in SPR and BBF
-    :raises ValueError: if the observations are no such images
+    :param make_trunk: function that creates the trunk for a number of channels
+    :param smallest: smallest legal height and width
+    :param features_dim: size of a linear layer with a ReLU after the convolutions; ``None``: no such layer
+    :param normalized_image: as in SB3's ``NatureCNN``: images are already floats, skip the check for uint8
+    :param rescale: whether to scale the output of the convolutions to [0, 1] per sample, as in SPR and BBF
+    :raises ValueError: if the observations are not such images
     """
 
     def __init__(
@@ -138,20 +138,20 @@ class ImageExtractor(BaseFeaturesExtractor):
             check_number("features_dim", features_dim, 1, whole=True)
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
             raise ValueError(
-                f"image encoder: expected uint8 images (channels, height, width) in [0, 255], found {observation_space}. "
-                "Use MlpPolicy for vectors, MultiInputPolicy for dicts, both without a features_extractor_class for images, "
-                "normalize_images=False for float images, and sb3_eqr.envs.minatar.ChannelsFirstImage around MinAtar's games."
+                f"observation_space must be uint8 images (channels, height, width) in [0, 255], got {observation_space}. "
+                "Use MlpPolicy for vectors, MultiInputPolicy for dicts (both without an image features_extractor_class), "
+                "normalize_images=False for float images, and sb3_eqr.envs.minatar.ChannelsFirstImage for MinAtar."
             )
         channels, height, width = observation_space.shape
         if min(height, width) < smallest:
             raise ValueError(
-                f"image encoder: expected images of at least {smallest}x{smallest} pixels, found {height}x{width}. "
+                f"Images must have at least {smallest}x{smallest} pixels, got {height}x{width}. "
                 "Pass a features_extractor_class with smaller filters."
             )
         trunk = make_trunk(channels)
         with th.no_grad():
             image = th.zeros(1, channels, height, width)
-            _, *self.map_shape = nn.Sequential(*list(trunk)[:-1])(image).shape  # (C, H, W), before they are flat
+            _, *self.map_shape = nn.Sequential(*list(trunk)[:-1])(image).shape  # (C, H, W), before flattening
             trunk_dim = prod(self.map_shape)
         super().__init__(observation_space, features_dim or trunk_dim)
         self.trunk = trunk
@@ -168,7 +168,7 @@ class ConvExtractor(ImageExtractor):
     """
     The paper's convolutions: :class:`ConvTrunk`. The other parameters are those of :class:`ImageExtractor`.
 
-    :param layers: (filters, kernel size, stride) of each convolution; the default ones take images of at least 36×36
+    :param layers: (filters, kernel size, stride) of each convolution; the default needs images of at least 36×36 pixels
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class ImpalaExtractor(ImageExtractor):
     """
     The residual network of IMPALA: :class:`ImpalaTrunk`. The other parameters are those of :class:`ImageExtractor`.
 
-    :param width_scale: multiplies the channels, ≥ 1/16; 4 in BBF (https://arxiv.org/abs/2305.19452)
+    :param width_scale: factor for the number of channels, ≥ 1/16; 4 in BBF (https://arxiv.org/abs/2305.19452)
     """
 
     def __init__(
@@ -199,17 +199,17 @@ class ImpalaExtractor(ImageExtractor):
         width_scale: float = 1,
         rescale: bool = False,
     ):
-        check_number("width_scale", width_scale, 1 / 16)  # one channel in the first stage
+        check_number("width_scale", width_scale, 1 / 16)  # at least one channel in the first stage
         make_trunk = partial(ImpalaTrunk, width_scale=width_scale)
         super().__init__(observation_space, make_trunk, 1, features_dim, normalized_image, rescale)
 
 
 class MlpExtractor(BaseFeaturesExtractor):
     """
-    Observations flattened, one linear layer and its ReLU: a trunk for vectors, in which Q-learning and latent model can share
-    something that is trained.
+    Flatten, one linear layer and a ReLU: a trunk for vectors, so that Q-learning and the latent model share trained
+    features.
 
-    :param observation_space: any but dictionaries
+    :param observation_space: any space except ``Dict``
     :param features_dim: size of the layer
     """
 
@@ -220,11 +220,11 @@ class MlpExtractor(BaseFeaturesExtractor):
         self.layers = nn.Sequential(flat, nn.Linear(flat.features_dim, features_dim), nn.ReLU())
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """(B, *obs_shape) to (B, features_dim)."""
+        """Map (B, *obs_shape) to (B, features_dim)."""
         return self.layers(observations)
 
 
-# Names for files that hold plain strings only.
+# Names for use in YAML files.
 TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {
     "nature": ConvExtractor,
     "impala": ImpalaExtractor,
@@ -234,16 +234,16 @@ TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {
 
 
 def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
-    """A features extractor, or the one of a name in ``TRUNKS``; raises ValueError for an unknown name."""
+    """Resolve a features extractor given as a class or by its name in ``TRUNKS``; raises ValueError for an unknown name."""
     if not isinstance(trunk, str):
         return trunk
     if trunk not in TRUNKS:
-        raise ValueError(f"features_extractor_class: expected a class or one of {list(TRUNKS)}, found {trunk!r}")
+        raise ValueError(f"features_extractor_class must be a class or one of {list(TRUNKS)}, got {trunk!r}.")
     return TRUNKS[trunk]
 
 
 def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> type[BaseFeaturesExtractor]:
-    """The paper's convolutions for images (floats already if ``normalized_image``), SB3's extractors otherwise."""
+    """The paper's convolutions for images (already floats if ``normalized_image``), SB3's extractors otherwise."""
     if isinstance(observation_space, spaces.Dict):
         return CombinedExtractor
     is_image = is_image_space(observation_space, normalized_image=normalized_image)
@@ -252,8 +252,8 @@ def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> ty
 
 class NormalizedExtractor(BaseFeaturesExtractor):
     """
-    A trunk and layer norm behind it (Ba et al. 2016, https://arxiv.org/abs/1607.06450): the features of each sample have mean
-    0 and variance 1, so that what differs between samples is as large as the layers behind it expect.
+    A trunk followed by layer norm (Ba et al. 2016, https://arxiv.org/abs/1607.06450): the features of each sample have mean 0
+    and variance 1, which is the scale that the next layers expect.
 
     :param trunk: any features extractor
     """
@@ -264,22 +264,22 @@ class NormalizedExtractor(BaseFeaturesExtractor):
         self.norm = nn.LayerNorm(trunk.features_dim)
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """What the trunk takes, to features, (B, features_dim)."""
+        """Map the trunk's input to features, (B, features_dim)."""
         return self.norm(self.trunk(observations))
 
 
 class GroupLayer(nn.Module):
     """
-    One linear layer to the Lie algebra, and the K group elements of it, flattened (Eq. 13, appendix B.4).
+    One linear layer to the Lie algebra, then K group elements, flattened (Eq. 13, appendix B.4).
 
     :param features_dim: F
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
-    :param n_blocks: K ≥ 1; ``None``: 12, for T(n) 32 (Table 5), and 1 where the name counts its own blocks
-        ("SE(2)^8 x SO(3)^4", "none")
-    :param parameterization: of rotations, "euler", "exp" or "gram-schmidt"
-    :param whiten: whether the algebra parameters are whitened over the batch
-        (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are driven apart
-    :raises ValueError: for an unknown group or a number of blocks below 1
+    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the name contains the number of blocks
+        ("SE(2)^8 x SO(3)^4") or is "none"
+    :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
+    :param whiten: whether to whiten the algebra parameters over the batch
+        (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are decorrelated
+    :raises ValueError: if the group is unknown or ``n_blocks`` is below 1
     """
 
     def __init__(
@@ -299,18 +299,18 @@ class GroupLayer(nn.Module):
         self.group = made
         self.n_blocks = n_blocks
         self.state_dim = n_blocks * prod(made.element_shape)  # D
-        self.description = f"{made}^{n_blocks}, {parameterization}"  # shapes of parameters do not determine the group
+        self.description = f"{made}^{n_blocks}, {parameterization}"  # the parameters' shapes do not determine the group
         n_params = n_blocks * made.num_params
         self.to_algebra: nn.Module = nn.Linear(features_dim, n_params)
         if whiten:
             self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
 
     def extra_repr(self) -> str:
-        """Group, blocks and size of a state."""
+        """Group, number of blocks and size of the state."""
         return f"{self.group}, n_blocks={self.n_blocks}, state_dim={self.state_dim}"
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        """Features, (B, F), to K flattened elements, (B, D)."""
+        """Map features, (B, F), to K flattened elements, (B, D)."""
         params = self.to_algebra(features)  # (B, K * num_params)
         return self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
 
@@ -318,20 +318,21 @@ class GroupLayer(nn.Module):
 class GroupFeaturesExtractor(BaseFeaturesExtractor):
     """
     A trunk and a :class:`GroupLayer`: τ_θ of Eq. 13.
-    It is a plain SB3 features extractor: stock QRDQN, DQN and PPO take it as ``features_extractor_class``.
+    It is an ordinary SB3 features extractor: SB3's DQN and PPO and SB3-Contrib's QRDQN accept it as
+    ``features_extractor_class``.
 
-    :param observation_space: any that the trunk takes
-    :param group: as in :class:`GroupLayer`, as the three below
+    :param observation_space: any space that the trunk accepts
+    :param group: as in :class:`GroupLayer`, like the next three
     :param n_blocks: K ≥ 1, or ``None``
-    :param parameterization: of rotations
-    :param whiten: whether the algebra parameters are whitened over the batch
-    :param layer_norm: whether layer norm stands behind the trunk
-    :param trunk_class: features extractor in front of the linear layer, or its name in ``TRUNKS``; ``None``: the
+    :param parameterization: parameterization of rotations
+    :param whiten: whether to whiten the algebra parameters over the batch
+    :param layer_norm: whether to apply layer norm to the trunk's features
+    :param trunk_class: features extractor before the linear layer, or its name in ``TRUNKS``; ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
-    :param normalized_image: as in SB3's extractors: images are floats already; reaches the default trunk
-    :param features_dim: size of the trunk's features, as SB3's extractors take it; ``None``: the trunk's own default
-    :raises ValueError: for an unknown group or a number of blocks below 1
+    :param normalized_image: as in SB3's extractors: images are already floats; passed to the default trunk
+    :param features_dim: size of the trunk's features, as in SB3's extractors; ``None``: the trunk's own default
+    :raises ValueError: if the group is unknown or ``n_blocks`` is below 1
     """
 
     def __init__(
@@ -347,7 +348,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         normalized_image: bool = False,
         features_dim: int | None = None,
     ):
-        super().__init__(observation_space, 1)  # its size is known below
+        super().__init__(observation_space, 1)  # the size is set below
         trunk_kwargs = dict(trunk_kwargs or {})
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
         is_default = trunk_class is None and found is not FlattenExtractor
@@ -361,5 +362,5 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         self._features_dim = self.group_layer.state_dim
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """Observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, features_dim)."""
+        """Map observations preprocessed by SB3, (B, ...) or a dict of these, to K flattened elements, (B, features_dim)."""
         return self.group_layer(self.trunk(observations))

@@ -1,4 +1,4 @@
-"""Layers that PyTorch does not have: noisy linear layers, the distributional head, whitening."""
+"""Layers that PyTorch lacks: noisy linear layers, the distributional head, whitening."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-Noise = tuple[th.Tensor, th.Tensor]  # f(ε_out), (out_features,), and f(ε_in), (in_features,), of one layer
+Noise = tuple[th.Tensor, th.Tensor]  # for one layer: f(ε_out), (out_features,), and f(ε_in), (in_features,)
 
 
 class NoisyLinear(nn.Module):
@@ -17,15 +17,15 @@ class NoisyLinear(nn.Module):
     Linear layer with factorised Gaussian noise (Fortunato et al. 2018, Eq. 9 to 11, https://arxiv.org/abs/1706.10295):
     y = (μ_w + σ_w ⊙ f(ε_out) f(ε_in)ᵀ) x + μ_b + σ_b ⊙ f(ε_out), with f(ε) = sign(ε) √|ε|.
 
-    Noise is given per call (:func:`draw_noise`): it does not depend on train or eval mode (SB3 explores in eval mode), and
-    there is none to store. One draw serves the batch.
+    Noise is passed to each call (:func:`draw_noise`), so it is independent of train or eval mode (SB3 explores in eval mode)
+    and is never stored. All samples of a batch share one draw.
 
     :param in_features: size of the input
     :param out_features: size of the output
     :param sigma_init: σ₀, ≥ 0; 0.5 in the paper and in Table 5
     """
 
-    SMALL_BATCH = 10  # below it, two products with vectors cost less than one with a noisy matrix, which has to be made
+    SMALL_BATCH = 10  # for smaller batches, two products cost less than building a noisy weight matrix for one product
 
     def __init__(self, in_features: int, out_features: int, sigma_init: float = 0.5):
         super().__init__()
@@ -38,7 +38,7 @@ class NoisyLinear(nn.Module):
     def forward(self, inputs: th.Tensor, noise: Noise | None = None) -> th.Tensor:
         """
         :param inputs: (B, in_features)
-        :param noise: of this layer; ``None``: the mean weights
+        :param noise: noise for this layer; ``None``: use the mean weights
         :return: (B, out_features)
         """
         if noise is None:
@@ -50,14 +50,14 @@ class NoisyLinear(nn.Module):
         return _NoisyProduct.apply(inputs, self.weight, self.bias, self.weight_sigma, self.bias_sigma, *noise)
 
     def extra_repr(self) -> str:
-        """As that of ``nn.Linear``."""
+        """As in ``nn.Linear``."""
         return "in_features={1}, out_features={0}".format(*self.weight.shape)
 
 
 class _NoisyProduct(th.autograd.Function):
     """
-    The formula of :class:`NoisyLinear`. Its gradient by hand: that of σ_w is that of μ_w times the noise, one product, where
-    autograd makes two and a copy of matrices that are larger than the batch.
+    The formula of :class:`NoisyLinear` with a hand-written gradient: the gradient of σ_w is that of μ_w times the noise, one
+    product, whereas autograd needs two and copies matrices that are larger than the batch.
     """
 
     @staticmethod
@@ -85,9 +85,10 @@ class _NoisyProduct(th.autograd.Function):
 
 def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
     """
-    Noise for one call of each layer, from torch's generator: f(ε) = sign(ε) √|ε| of all of them in one draw.
+    Draw the noise f(ε) = sign(ε) √|ε| for one call of each layer, from torch's generator, in a single draw.
 
-    :param layers: at least one
+    :param layers: at least one layer
+    :return: the noise for each layer
     """
     sizes = [size for layer in layers for size in layer.weight.shape]
     weight = layers[0].weight
@@ -97,7 +98,7 @@ def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
 
 
 def make_linear(n_in: int, n_out: int, sigma_init: float | None) -> nn.Linear | NoisyLinear:
-    """A noisy layer, or without ``sigma_init`` a plain one."""
+    """A noisy linear layer, or a plain one if ``sigma_init`` is ``None``."""
     return nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
 
 
@@ -106,8 +107,8 @@ class MLP(nn.Sequential):
     Linear layers with activations between them.
 
     :param sizes: input size, hidden sizes, output size
-    :param activation_fn: activation after every layer but the last
-    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    :param activation_fn: activation after every layer except the last
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain layers
     """
 
     def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
@@ -119,7 +120,7 @@ class MLP(nn.Sequential):
     def forward(self, inputs: th.Tensor, noise: Iterator[Noise] | None = None) -> th.Tensor:
         """
         :param inputs: (B, sizes[0])
-        :param noise: of the noisy layers one by one; ``None``: their mean weights
+        :param noise: noise for the noisy layers, in order; ``None``: use their mean weights
         :return: (B, sizes[-1])
         """
         for module in self:
@@ -129,18 +130,19 @@ class MLP(nn.Sequential):
 
 class DistributionalHead(nn.Module):
     """
-    State features to ``n_atoms`` numbers (quantiles or logits) per action.
+    Map features to ``n_atoms`` numbers (quantiles or logits) per action.
 
-    With ``dueling``, a value and an advantage stream (Wang et al. 2016, https://arxiv.org/abs/1511.06581); without it, the
-    advantage stream alone is the head. The first layers of both are one layer, twice as wide: one product is faster than two.
+    With ``dueling``, the head has a value and an advantage stream (Wang et al. 2016, https://arxiv.org/abs/1511.06581);
+    otherwise only the advantage stream. The first layers of both streams are merged into one layer of twice the width, because
+    one product is faster than two.
 
     :param features_dim: D
     :param n_actions: A
     :param n_atoms: N
     :param net_arch: hidden sizes
     :param activation_fn: activation between layers
-    :param dueling: whether to split value from advantage
-    :param sigma_init: initial noise of noisy layers; ``None`` for plain ones
+    :param dueling: whether to use separate value and advantage streams
+    :param sigma_init: initial noise of noisy layers; ``None`` for plain layers
     """
 
     def __init__(
@@ -169,7 +171,7 @@ class DistributionalHead(nn.Module):
     def forward(self, features: th.Tensor, noisy: bool = False) -> th.Tensor:
         """
         :param features: (B, D)
-        :param noisy: draw noise in noisy layers; one draw serves the batch
+        :param noisy: whether to draw noise for the noisy layers; all samples share one draw
         :return: (B, N, A)
         """
         noise = iter(draw_noise(self._noisy_layers)) if noisy and self._noisy_layers else None
@@ -183,24 +185,24 @@ class DistributionalHead(nn.Module):
 
     def project(self, features: th.Tensor) -> th.Tensor:
         """
-        The projection p of the AET loss: the first layer of every stream, before its activation, noise off (appendix B.4).
+        The projection p of the AET loss: the first layer of each stream, before the activation, without noise (appendix B.4).
 
         :param features: (N, D)
-        :return: (N, P): P is the first hidden size, twice that if dueling
+        :return: (N, P), where P is the first hidden size, or twice that with ``dueling``
         """
         return self.first(features)
 
 
 class Whitening(nn.Module):
     """
-    Batch norm that looks at all features at once: mean 0, variance 1 and no correlation over the batch, by the Cholesky factor
-    of the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). Without scale and offset, so that a collapse
-    to a point is out of reach. A batch of B samples tells the covariance of D features only so well, so D / (D + B) of each
-    correlation is not believed and stays: a feature that others explain keeps a variance of about that share of its own, not
-    1. In eval mode the statistics are running means.
+    Batch norm over all features jointly: mean 0, variance 1 and no correlations over the batch, using the Cholesky factor of
+    the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). It has no scale and offset, so features cannot
+    collapse to a point. A batch of B samples gives only a noisy estimate of the covariance of D features, so the estimated
+    correlations are shrunk by the fraction D / (D + B), which is therefore not removed: a feature that is determined by the
+    others keeps a variance of about this fraction instead of 1. Eval mode uses running means of the statistics.
 
     :param n_features: D
-    :param momentum: of the running means, as in PyTorch's batch norm
+    :param momentum: momentum of the running means, as in PyTorch's batch norm
     """
 
     running_mean: th.Tensor  # (D,)
@@ -228,9 +230,9 @@ class Whitening(nn.Module):
             covariance = th.lerp(centred.mT @ centred / n, variances, n_features / (n_features + n))
             with th.no_grad():
                 self.running_count += 1
-                weight = (1 / self.running_count).clamp(min=self.momentum)  # the first batch counts whole
+                weight = (1 / self.running_count).clamp(min=self.momentum)  # the first batch has weight 1
                 self.running_mean.lerp_(mean, weight)
                 self.running_covariance.lerp_(covariance, weight)
-        smallest = th.diag(1e-5 * covariance.diagonal() + 1e-12)  # relative: untrained features differ by very little
+        smallest = th.diag(1e-5 * covariance.diagonal() + 1e-12)  # relative, because untrained features vary very little
         factor, _ = th.linalg.cholesky_ex(covariance + smallest)
         return th.linalg.solve_triangular(factor, (features - mean).mT, upper=False).mT

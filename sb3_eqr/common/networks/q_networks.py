@@ -1,4 +1,4 @@
-"""What online and target networks of every EqR agent have in common."""
+"""Base class of the online and target networks of all EqR agents."""
 
 from abc import abstractmethod
 from typing import Any
@@ -19,7 +19,7 @@ class EqRNetwork(BasePolicy):
     :param observation_space: Observation space
     :param action_space: Action space
     :param features_extractor: the group encoder
-    :param head: takes its features
+    :param head: the Q head, which takes its features
     :param normalize_images: Whether to divide images by 255
     """
 
@@ -31,20 +31,20 @@ class EqRNetwork(BasePolicy):
         head: DistributionalHead,
         normalize_images: bool,
     ):
-        # Not the constructor of the stock network beside it: that would build a head that is thrown away.
+        # Skip the constructor of the stock network, which would build another head.
         BasePolicy.__init__(
             self, observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.head = head
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
-        """Features of observations, (B, *obs_shape) or a dict of these: (B, D)."""
+        """Features, (B, D), of observations, (B, *obs_shape) or a dict of these."""
         return self.extract_features(obs, self.features_extractor)
 
     @abstractmethod
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         """
-        :param outputs: of the head, (B, N, A), or those of one action, (B, N)
+        :param outputs: outputs of the head, (B, N, A), or those for one action, (B, N)
         :return: Q values, (B, A), or (B,)
         """
 
@@ -53,12 +53,12 @@ class EqRNetwork(BasePolicy):
         self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        The head's own loss.
+        The TD loss of this kind of head.
 
         :param current: outputs of the online head for (s_t, a_t), (B, N)
-        :param following: those of the target head after the n-step transition, for the best action, no gradient, (B, N)
+        :param following: outputs of the target head after the n-step transition, for the best action, no gradient, (B, N)
         :param rewards: the n-step return, (B, 1)
-        :param discounts: 0 where the transition ended in a terminal state, γ to its length elsewhere, (B, 1)
+        :param discounts: 0 where the transition ended in a terminal state, otherwise γ to the power of its length, (B, 1)
         :return: loss, (B,), and priorities ≥ 0 without gradient, (B,)
         """
 

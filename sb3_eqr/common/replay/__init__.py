@@ -1,5 +1,5 @@
 """
-Replay of windows: ``buffers`` draws them, ``frame_store`` keeps every frame once, ``sum_tree`` draws by priority.
+Replay of windows: ``buffers`` samples them, ``frame_store`` stores each frame once, ``sum_tree`` samples by priority.
 """
 
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer

@@ -1,4 +1,4 @@
-"""Replay buffers as arrays and plain data in one file, which is read without executing anything."""
+"""Replay buffer files: arrays and plain data in one file. Reading it executes no code."""
 
 import json
 import zipfile
@@ -10,15 +10,15 @@ from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.replay.frame_store import FrameStore
 from sb3_eqr.common.replay.sum_tree import SumTree
 
-PARTS = {kind.__name__: kind for kind in (FrameStore, SumTree)}  # of a buffer, with arrays of their own
-DATA = "data"  # the member that holds all but the arrays
+PARTS = {kind.__name__: kind for kind in (FrameStore, SumTree)}  # components of a buffer that hold arrays
+DATA = "data"  # the zip member that holds everything except the arrays
 
 
 def write_buffer(file: BinaryIO, buffer: Any, notes: dict[str, Any]) -> None:
     """
     :param file: open for writing
-    :param buffer: a replay buffer of this package, or one derived from it
-    :param notes: what else to keep, as JSON
+    :param buffer: a replay buffer of this package, or of a derived class
+    :param notes: additional data to store, as JSON
     """
     arrays: dict[str, np.ndarray] = {}
     data = {"class": type(buffer).__name__, "notes": notes, "state": _packed(vars(buffer), "", arrays)}
@@ -27,23 +27,23 @@ def write_buffer(file: BinaryIO, buffer: Any, notes: dict[str, Any]) -> None:
 
 def read_buffer(file: BinaryIO, like: Any) -> tuple[Any, dict[str, Any]]:
     """
-    :param file: of :func:`write_buffer`, open for reading
+    :param file: file written by :func:`write_buffer`, open for reading
     :param like: a buffer of the same class
-    :return: the buffer, and the notes
-    :raises ValueError: if the file is truncated, changed, or something else
+    :return: the buffer and the notes
+    :raises ValueError: if the file is truncated, modified, or of another kind
     """
     try:
-        with np.load(file, allow_pickle=False) as members:  # the zip format checks a sum of each member
+        with np.load(file, allow_pickle=False) as members:  # verifies the zip checksum of each member
             if not isinstance(members[DATA], np.ndarray):
-                raise ValueError("it is a model or another zip file, no replay buffer")
+                raise ValueError("it is a model or another zip file, not a replay buffer")
             data = json.loads(members[DATA].tobytes())
             state = _unpacked(data["state"], members)
     except (zipfile.BadZipFile, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from error
     if data["class"] != type(like).__name__:
-        raise ValueError(f"a {type(like).__name__} is needed, this is a {data['class']}")
+        raise ValueError(f"it must be a {type(like).__name__}, got a {data['class']}")
     if state.keys() != vars(like).keys():
-        raise ValueError(f"it was saved by another version, with other attributes: {sorted(state.keys() ^ vars(like).keys())}")
+        raise ValueError(f"it was saved by another version, attributes differ: {sorted(state.keys() ^ vars(like).keys())}")
     buffer = object.__new__(type(like))
     vars(buffer).update(state)
     return buffer, data["notes"]

@@ -1,4 +1,4 @@
-"""Replay of windows: the n-step transition and the M-step rollout that start at the same step, from one storage."""
+"""Replay of windows: n-step transitions and M-step rollouts that start at the same step, from one storage."""
 
 import warnings
 from typing import Any
@@ -25,26 +25,26 @@ class SequenceReplayBuffer(ReplayBuffer):
     """
     Uniform replay of n-step transitions with M-step rollouts.
 
-    ``add`` and ``sample`` are SB3's. Every observation is stored once, and every frame of a stack once (see
+    ``add`` and ``sample`` have SB3's interface. Each observation, and each frame of a stack, is stored once (see
     :class:`~sb3_eqr.common.replay.frame_store.FrameStore`). Terminal observations are kept. ``n_steps``, ``gamma`` and
-    ``prediction_depth`` are read at each call of ``sample``, so a schedule may move them.
+    ``prediction_depth`` are read at each call of ``sample``, so a schedule may change them.
 
-    Without a rollout (M = 0) this is SB3's ``NStepReplayBuffer``, to the same draws: a return that would cross the
-    write head is cut there and bootstraps from the newest observation. With a rollout, no start is drawn whose window
-    of max(n, M) transitions would cross the write head.
+    Without a rollout (M = 0), samples are identical to those of SB3's ``NStepReplayBuffer``, for the same random numbers: a
+    return that would cross the write position is truncated there and bootstraps from the newest observation. With a rollout,
+    starts whose window of max(n, M) transitions would cross the write position are not drawn.
 
     :param buffer_size: number of transitions, over all environments; per environment at least n + M + 1
-    :param observation_space: any that SB3 supports
+    :param observation_space: any space that SB3 supports
     :param action_space: Discrete
-    :param device: where samples go
+    :param device: device of the samples
     :param n_envs: number of parallel environments
-    :param optimize_memory_usage: ignored: memory is always saved
-    :param handle_timeout_termination: whether a time-out (``TimeLimit.truncated``) is distinguished from a terminal state
+    :param optimize_memory_usage: ignored, because the memory usage is always optimised
+    :param handle_timeout_termination: whether to distinguish time-outs (``TimeLimit.truncated``) from terminal states
     :param n_steps: n ≥ 1
     :param gamma: γ in [0, 1]
     :param prediction_depth: M ≥ 0
-    :param frame_stack: number of frames stacked along the first axis of a channels-first image; 1: stored whole
-    :raises ValueError: if one of these is out of its range
+    :param frame_stack: number of frames stacked along the first axis of a channels-first image; 1: no stacking
+    :raises ValueError: if an argument is out of range
     """
 
     timeouts: np.ndarray
@@ -98,32 +98,32 @@ class SequenceReplayBuffer(ReplayBuffer):
         needed = self.n_steps + self.prediction_depth + 1
         if self.buffer_size < needed:
             raise ValueError(
-                f"buffer_size: expected at least n_steps + prediction_depth + 1 = {needed} transitions per environment, "
-                f"found {self.buffer_size} ({self.n_envs} environments). Pass buffer_size={needed * self.n_envs} or more."
+                f"buffer_size must be at least n_steps + prediction_depth + 1 = {needed} transitions per environment, "
+                f"got {self.buffer_size} ({self.n_envs} environments). Pass buffer_size={needed * self.n_envs} or more."
             )
         channels = self.obs_shape[0] if isinstance(self.observation_space, spaces.Box) and self.obs_shape else 1
         if frame_stack < 1 or channels % frame_stack != 0:
             raise ValueError(
-                f"frame_stack: expected a divisor of the first axis of the observations (channels first), found "
-                f"{frame_stack} for {self.observation_space}. Pass frame_stack=1 to store observations whole."
+                f"frame_stack must divide the first axis of the observations (channels first), got {frame_stack} for "
+                f"{self.observation_space}. Pass frame_stack=1 to store observations without splitting them into frames."
             )
 
     @property
     def nbytes(self) -> int:
-        """Memory of everything stored, in bytes."""
+        """Memory usage, in bytes."""
         arrays = (self.actions, self.rewards, self.dones, self.timeouts)
         return sum(store.nbytes for store in self._stores.values()) + sum(array.nbytes for array in arrays)
 
     @property
     def window(self) -> int:
-        """Number of transitions that a start needs after it, itself included."""
+        """Number of transitions in a window, including the one at its start."""
         return max(self.n_steps, self.prediction_depth)
 
     def can_sample(self) -> bool:
         """
-        Whether there is a start to draw.
+        Whether the buffer holds enough transitions to sample.
 
-        :raises ValueError: if ``n_steps`` or ``prediction_depth`` has been moved beyond what the buffer can hold
+        :raises ValueError: if the buffer is too small for the current ``n_steps`` or ``prediction_depth``
         """
         self._check_arguments(frame_stack=1)
         return self.size() >= (self.window if self.prediction_depth > 0 else 1)
@@ -141,19 +141,19 @@ class SequenceReplayBuffer(ReplayBuffer):
         Store one transition per environment; every array is (n_envs, ...).
 
         :param obs: s_t
-        :param next_obs: s_{t+1}, the terminal observation where the episode ended
+        :param next_obs: s_{t+1}; at the end of an episode, the terminal observation
         :param action: a_t
         :param reward: r_{t+1}
         :param done: whether the episode ended, by a terminal state or a time-out
         :param infos: one dict per environment; ``TimeLimit.truncated`` marks a time-out
-        :raises ValueError: for an action out of range, and for a number that is not finite; nothing is stored then
+        :raises ValueError: if an action is out of range or a number is not finite; nothing is stored in this case
         """
         check_transition(self.action_space, obs, next_obs, action, reward)
         follows = np.ones(self.n_envs, dtype=bool)
         for key, store in self._stores.items():
             now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
             follows &= store.add(self.pos, self._shaped(now, store), self._shaped(then, store), overwrite=self.full)
-        # An environment that was reset in the middle of an episode (a second call of learn) cuts it like a time-out.
+        # A reset in the middle of an episode (by a second call of learn) counts as a time-out.
         self.timeouts[self.pos - 1, ~follows & ~self._episode_starts] = 1.0
 
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
@@ -169,58 +169,61 @@ class SequenceReplayBuffer(ReplayBuffer):
             self.pos = 0
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Remove all transitions."""
         super().reset()
         self._stores = {key: store.emptied() for key, store in self._stores.items()}
         self._episode_starts[:] = True
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
         """
+        Sample windows uniformly.
+
         :param batch_size: B
-        :param env: normalises observations and one-step rewards, where given
-        :return: B windows, drawn uniformly from NumPy's global generator (which ``set_random_seed`` seeds)
+        :param env: if given, normalises observations and one-step rewards
+        :return: B windows, drawn with NumPy's global generator (which ``set_random_seed`` seeds)
         """
-        if self.prediction_depth == 0:  # SB3's own draws
+        if self.prediction_depth == 0:  # the same draws as SB3
             positions = np.random.randint(0, self.size(), size=batch_size)
         else:
             positions = self._positions(np.random.randint(0, self.n_starts, size=batch_size))
         return self._windows(positions, np.random.randint(0, self.n_envs, size=batch_size), env)
 
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
-        """Uniform replay keeps none; see :class:`PrioritizedSequenceReplayBuffer`."""
+        """Do nothing: uniform replay has no priorities; see :class:`PrioritizedSequenceReplayBuffer`."""
 
     @property
     def n_starts(self) -> int:
-        """How many steps have a complete window behind them, per environment."""
+        """Number of steps per environment at which a complete window starts."""
         return self.size() - self.window + 1
 
     def windows(self, starts: np.ndarray, envs: np.ndarray, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
         """
-        Windows of one's own choice.
+        Return the windows with the given starts.
 
-        :param starts: steps, 0 is the oldest stored, below ``n_starts``, (B,)
+        :param starts: steps below ``n_starts``, where 0 is the oldest stored step, (B,)
         :param envs: environments, (B,)
         :param env: as for :meth:`sample`
+        :return: B windows
         """
         return self._windows(self._positions(starts), envs, env)
 
     def _positions(self, starts: np.ndarray) -> np.ndarray:
-        return (starts + (self.pos if self.full else 0)) % self.buffer_size  # from the oldest on
+        return (starts + (self.pos if self.full else 0)) % self.buffer_size  # counted from the oldest step
 
     def _windows(self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SequenceReplayBufferSamples:
-        """The windows that start at ``positions``, (B,), of ``envs``, (B,)."""
+        """The windows of environments ``envs``, (B,), that start at ``positions``, (B,)."""
         n, depth = self.n_steps, self.prediction_depth
         columns = envs[:, None]
         steps = np.arange(max(n, depth))
         window = (positions[:, None] + steps) % self.buffer_size  # (B, W)
-        # The newest transition ends a window: what lies behind the write head is the oldest data.
+        # The newest transition ends a window, because the oldest data follow the write position.
         ends = (self.dones[window, columns] + self.timeouts[window, columns] > 0) | (
             window == (self.pos - 1) % self.buffer_size
         )
         first_end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(steps) - 1)  # (B,)
         rewards = self._normalize_reward(self.rewards[window, columns], env)  # (B, W)
 
-        # The n-step transition: rewards up to its end, bootstrap from the observation after.
+        # The n-step transition: rewards up to its end, and the next observation for bootstrapping.
         last_step = np.minimum(first_end, n - 1)
         included = steps[:n] <= last_step[:, None]  # (B, n)
         powers = self.gamma ** np.arange(n, dtype=np.float32)
@@ -241,7 +244,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         if depth == 0:
             return samples
         mask = steps[:depth] <= first_end[:, None]  # (B, M)
-        # Beyond the end, the last transition is repeated: nothing of another episode gets in, masked or not.
+        # Beyond the end, repeat the last transition, so that no data of another episode get in, masked or not.
         rollout = (positions[:, None] + np.minimum(steps[:depth], first_end[:, None])) % self.buffer_size
         return samples._replace(
             rollout_observations=self._observations(rollout, columns, env, following=True),
@@ -253,7 +256,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     def _observations(
         self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, following: bool = False
     ) -> PyTorchObs:
-        """As :meth:`FrameStore.observations`, normalised, on the device, one for each key of a dict."""
+        """As :meth:`FrameStore.observations`, normalised and moved to the device, for each key of a dict."""
         found = {key: store.observations(positions, envs, following) for key, store in self._stores.items()}
         is_dict = isinstance(self.observation_space, spaces.Dict)
         observations = self._normalize_obs(found if is_dict else found[""], env)
@@ -262,7 +265,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         return self._tensor(observations)
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
-        tensor = th.from_numpy(array)  # arrays here are copies already
+        tensor = th.from_numpy(array)  # these arrays are already copies
         return tensor if self.device.type == "cpu" else tensor.to(self.device)
 
     def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
@@ -271,8 +274,8 @@ class SequenceReplayBuffer(ReplayBuffer):
             return obs.reshape(shape)
         if obs.shape != shape:
             raise ValueError(
-                f"observations: expected the shape {shape} of the replay buffer, found {obs.shape}. "
-                "Wrappers that change the shape (VecTransposeImage, VecFrameStack) belong inside VecNormalize."
+                f"observations must have the replay buffer's shape {shape}, got {obs.shape}. "
+                "Put wrappers that change the shape (VecTransposeImage, VecFrameStack) inside VecNormalize."
             )
         return obs
 
@@ -280,18 +283,18 @@ class SequenceReplayBuffer(ReplayBuffer):
 class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
     """
     Proportional prioritised replay (Schaul et al. 2016, https://arxiv.org/abs/1511.05952) of the same windows:
-    P(i) ∝ p_i^α over all environments, weights w_i = (N P(i))^−β over their maximum in the batch.
+    P(i) ∝ p_i^α over all environments, weights w_i = (N P(i))^−β divided by their maximum in the batch.
 
-    A transition enters with the largest priority so far, as soon as its window is complete.
+    A new transition gets the largest priority so far, as soon as its window is complete.
     See :class:`SequenceReplayBuffer` for the other parameters.
 
-    :param alpha: α ≥ 0; 0 is uniform; 0.5 in Table 5
+    :param alpha: α ≥ 0; 0 gives uniform replay; 0.5 in Table 5
     :param beta: β in [0, 1] at the start of training, 0.4 in Table 5; the attribute is read at each call of ``sample``
-    :param final_beta: β in [0, 1] at the end of training, reached linearly; 1 in Table 5. With ``alpha=0.5, beta=0.5``, 0.5
+    :param final_beta: β in [0, 1] at the end of training, annealed linearly; 1 in Table 5. 0.5 with ``alpha=0.5, beta=0.5``
         gives the weights 1/√P of BBF (https://arxiv.org/abs/2305.19452)
     """
 
-    PRIORITY_EPS = 1e-6  # keeps a sample of zero error drawable
+    PRIORITY_EPS = 1e-6  # so that samples with zero error can still be drawn
 
     def __init__(
         self,
@@ -329,11 +332,11 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         self.final_beta = final_beta
         self._tree = SumTree(self.buffer_size * n_envs)
         self._max_priority = 1.0  # p^α of the largest priority so far
-        self._tree_window = self.window  # the window that the tree's zeros stand for
+        self._tree_window = self.window  # the window size for which incomplete starts have priority 0 in the tree
 
     @property
     def nbytes(self) -> int:
-        """Memory of everything stored, in bytes."""
+        """Memory usage, in bytes."""
         return super().nbytes + self._tree.nbytes
 
     def can_sample(self) -> bool:
@@ -347,30 +350,30 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
     def add(self, *args, **kwargs) -> None:
         self._follow_window()
         super().add(*args, **kwargs)
-        self._set_ages(0, 1, 0.0)  # what was overwritten
+        self._set_ages(0, 1, 0.0)  # the overwritten start
         self._set_ages(self._tree_window - 1, self._tree_window, self._max_priority)
 
     def anneal_beta(self, progress_remaining: float) -> None:
-        """Move β to where it is with so much of training remaining, from 1 to 0."""
+        """Set β for the remaining fraction of training, which goes from 1 to 0."""
         self.beta = self.final_beta + (self.initial_beta - self.final_beta) * progress_remaining
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
-        """As :class:`SequenceReplayBuffer` does, stratified by priority; ``indices`` is for :meth:`update_priorities`."""
+        """As :class:`SequenceReplayBuffer`, but stratified by priority; pass ``indices`` to :meth:`update_priorities`."""
         self._follow_window()
         leaves = self._tree.sample(batch_size, np.random.random_sample(batch_size))
         priorities = self._tree.get(leaves)
-        # (N P(i))^-β over its maximum: N and the sum of priorities cancel.
+        # (N P(i))^-β divided by its maximum: N and the sum of priorities cancel.
         weights = (priorities.min() / priorities) ** self.beta
         samples = self._windows(*np.divmod(leaves, self.n_envs), env)
         return samples._replace(weights=self._tensor(weights.astype(np.float32)))
 
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
         """
-        New priorities p ≥ 0 of samples, (B,), by their ``indices``, (B,). Those that are not finite are left out, and samples
-        that cannot be drawn any more.
+        Set the priorities p ≥ 0, (B,), of the samples with these ``indices``, (B,). Priorities that are not finite and
+        samples that can no longer be drawn are ignored.
         """
         scaled = (priorities.numpy(force=True).astype(np.float64) + self.PRIORITY_EPS) ** self.alpha
-        # A start that was overwritten, or has no whole window any more, stays at 0.
+        # The priority stays 0 for a start that was overwritten, or whose window is no longer complete.
         takes_part = np.isfinite(scaled) & (self._tree.get(indices) > 0)
         if not takes_part.all():
             indices, scaled = indices[takes_part], scaled[takes_part]
@@ -379,7 +382,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
             self._max_priority = max(self._max_priority, float(scaled.max()))
 
     def _follow_window(self) -> None:
-        """Open or close the youngest starts where n or M has moved."""
+        """Enable or disable the youngest starts if n or M has changed."""
         if self.window < self._tree_window:
             self._set_ages(self.window - 1, self._tree_window - 1, self._max_priority)
         elif self.window > self._tree_window:
@@ -387,7 +390,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
         self._tree_window = self.window
 
     def _set_ages(self, youngest: int, end: int, priority: float) -> None:
-        """The priority of transitions of ages ``youngest`` to ``end`` - 1; the newest has age 0."""
+        """Set the priority of the transitions with ages ``youngest`` to ``end`` - 1; the newest has age 0."""
         ages = np.arange(youngest, min(end, self.size()))
         positions = (self.pos - 1 - ages) % self.buffer_size
         leaves = (positions[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()

@@ -1,26 +1,26 @@
-"""Observations kept once: frames in one array, each stored transition holding the indices of its own."""
+"""Storage that keeps each frame once: frames in one array, and their indices for each transition."""
 
 from typing import Any
 
 import numpy as np
 
-_ZERO = 0  # slot 0 always holds zeros: VecFrameStack pads the first observations of an episode with them
+_ZERO = 0  # slot 0 always holds the zeros with which VecFrameStack pads the first observations of an episode
 
 
 class FrameStore:
     """
-    A ring of (observation, next observation) pairs, per environment, in which every frame is stored once.
+    A ring buffer of (observation, next observation) pairs for each environment that stores each frame once.
 
-    An observation is a stack of ``n_stack`` frames along its first axis (1: no stack, stored whole). A pair holds the
-    indices of its n_stack + 1 frames; consecutive pairs of an episode share all but the newest. Frames are reference
-    counted, so what an overwritten pair alone used is free for the next one. Contents are compared bit by bit before
-    they are shared: what comes out is what went in, whatever resets, pads or truncates episodes.
+    An observation is a stack of ``n_stack`` frames along its first axis (1: no stacking). A pair holds the
+    indices of its n_stack + 1 frames; consecutive pairs of an episode share all frames except the newest. Frames are
+    reference-counted, so frames used only by an overwritten pair are reused. Frames are compared bit by bit before they are
+    shared, so observations are always returned unchanged, however episodes are reset, padded or truncated.
 
-    :param n_positions: length of the ring
-    :param n_envs: environments, stored side by side
+    :param n_positions: length of the ring buffer
+    :param n_envs: number of environments
     :param obs_shape: shape of one observation; the first axis must be divisible by ``n_stack``
-    :param dtype: of the observations
-    :param n_stack: frames per observation
+    :param dtype: dtype of the observations
+    :param n_stack: number of frames per observation
     """
 
     def __init__(self, n_positions: int, n_envs: int, obs_shape: tuple[int, ...], dtype: np.dtype, n_stack: int = 1):
@@ -28,11 +28,11 @@ class FrameStore:
         self.obs_shape = obs_shape
         self._frame_shape = (obs_shape[0] // n_stack, *obs_shape[1:])
         self._ids = np.zeros((n_positions, n_envs, n_stack + 1), dtype=np.int32)
-        # One frame per transition, and one more per episode: the array grows where episodes are short.
+        # One frame per transition, and one more per episode; the array grows if episodes are short.
         n_transitions = n_positions * n_envs
         self._allocate_arrays(1 + n_transitions + n_transitions // 64 + n_envs * (n_stack + 1), np.dtype(dtype))
-        self._n_used = 1  # slots below this have been handed out at some time
-        self._n_free = 0  # of these, the ones given back: the first entries of _free
+        self._n_used = 1  # slots below this have been used at some time
+        self._n_free = 0  # number of these that are free again, listed in the first entries of _free
 
     def _allocate_arrays(self, capacity: int, dtype: np.dtype) -> None:
         self._frames = np.zeros((capacity, *self._frame_shape), dtype=dtype)
@@ -45,26 +45,26 @@ class FrameStore:
 
     @property
     def nbytes(self) -> int:
-        """Memory, in bytes."""
+        """Memory usage, in bytes."""
         return self._frames.nbytes + self._references.nbytes + self._free.nbytes + self._ids.nbytes
 
     def add(self, position: int, obs: np.ndarray, next_obs: np.ndarray, overwrite: bool) -> np.ndarray:
         """
         Store one pair per environment.
 
-        :param position: where in the ring; positions are written in order
+        :param position: position in the ring buffer; positions are written in order
         :param obs: (n_envs, *obs_shape)
         :param next_obs: (n_envs, *obs_shape)
-        :param overwrite: whether the ring holds an older pair here
-        :return: whether ``obs`` is the next observation of the pair before, (n_envs,)
-        :raises ValueError: if ``next_obs`` is not ``obs`` moved on by one frame
+        :param overwrite: whether this position holds an older pair
+        :return: whether ``obs`` is the next observation of the previous pair, (n_envs,)
+        :raises ValueError: if ``next_obs`` is not ``obs`` shifted by one frame
         """
         stacks, next_stacks = self._as_stacks(obs), self._as_stacks(next_obs)  # (n_envs, n_stack, *frame_shape)
         if not np.array_equal(_bits(stacks[:, 1:]), _bits(next_stacks[:, :-1])):
             raise ValueError(
-                f"frame_stack={self.n_stack}: expected each observation to be the previous one with its oldest frame "
-                "dropped and one frame appended along the first axis, found another order. "
-                'Pass replay_buffer_kwargs={"frame_stack": 1} to store observations whole.'
+                f"frame_stack={self.n_stack}: each observation must be the previous one with its oldest frame "
+                "dropped and one frame appended along the first axis, got another order. "
+                'Pass replay_buffer_kwargs={"frame_stack": 1} to store observations without splitting them into frames.'
             )
         if overwrite:
             self._release(self._ids[position])
@@ -83,8 +83,8 @@ class FrameStore:
 
     def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> np.ndarray:
         """
-        Observations, or those ``following``, of the pairs at ``positions``, (...), of ``envs``, broadcast against them: a
-        copy, (..., *obs_shape).
+        The observations, or with ``following`` the next observations, of the pairs of ``envs`` at ``positions``, both (...)
+        and broadcast: a copy, (..., *obs_shape).
         """
         ids = self._ids[positions, envs, 1:] if following else self._ids[positions, envs, :-1]  # (..., n_stack)
         return self._frames[ids].reshape(*ids.shape[:-1], *self.obs_shape)
@@ -97,7 +97,7 @@ class FrameStore:
         for k, frame in enumerate(stack):
             if self.n_stack > 1 and not _bits(frame).any():
                 ids.append(_ZERO)
-            elif k > 0 and np.array_equal(_bits(frame), _bits(stack[k - 1])):  # padded with the first frame
+            elif k > 0 and np.array_equal(_bits(frame), _bits(stack[k - 1])):  # padding with the first frame
                 ids.append(ids[-1])
             else:
                 ids.append(int(self._take_slots(1)[0]))
@@ -107,7 +107,7 @@ class FrameStore:
     def _take_slots(self, count: int) -> np.ndarray:
         reused = min(count, self._n_free)
         self._n_free -= reused
-        slots = self._free[self._n_free : self._n_free + reused].copy()  # growing moves the array
+        slots = self._free[self._n_free : self._n_free + reused].copy()  # a copy, because growing moves the array
         fresh = np.arange(self._n_used, self._n_used + count - reused, dtype=np.int32)
         self._n_used += count - reused
         if self._n_used > len(self._frames):
@@ -127,7 +127,7 @@ class FrameStore:
         self._n_free += len(unused)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Only slots in use are saved, so that a buffer filled to a tenth makes a file of a tenth."""
+        """Save only used slots, so that the file size is proportional to the number of stored transitions."""
         state = self.__dict__.copy()
         state["_capacity"] = len(self._frames)
         for name in ("_frames", "_references", "_free"):
