@@ -1,4 +1,4 @@
-"""What each argument may be, in one table: the constructors check by it, the tests read it."""
+"""The legal values of all arguments, in tables that the constructors, the tests and the documentation use."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -11,8 +11,8 @@ from torch import nn
 
 class Rule(NamedTuple):
     """
-    :param says: what a value must be, as it stands in messages: "an integer >= 1"
-    :param holds: whether a value is
+    :param says: description of the legal values for error messages, such as "an integer >= 1"
+    :param holds: function that returns whether a value is legal
     """
 
     says: str
@@ -23,12 +23,12 @@ class Rule(NamedTuple):
 
 
 def number(low: float = -np.inf, high: float = np.inf, above: bool = False) -> Rule:
-    """A finite number in [low, high]; with ``above``, in (low, high]. Flags are no numbers."""
+    """A finite number in [low, high], or in (low, high] with ``above``. Booleans are not accepted."""
     return _in_range("a finite number", (int, float, np.integer, np.floating), low, high, above)
 
 
 def integer(low: float = -np.inf, high: float = np.inf) -> Rule:
-    """An integer in [low, high]. 32.0 is none, and neither are flags."""
+    """An integer in [low, high]. Floats such as 32.0 and booleans are not accepted."""
     return _in_range("an integer", (int, np.integer), low, high, False)
 
 
@@ -47,7 +47,7 @@ def _in_range(kind: str, types: tuple[type, ...], low: float, high: float, above
 
 
 def one_of(choices: Iterable[Any]) -> Rule:
-    """One of a few strings."""
+    """One of the given strings."""
     legal = list(choices)
     return Rule(f"one of {legal}", lambda value: isinstance(value, str) and value in legal)
 
@@ -58,12 +58,12 @@ def a(kind: type, says: str) -> Rule:
 
 
 def a_subclass(kind: type, says: str) -> Rule:
-    """A class derived from another one."""
+    """A subclass of a class."""
     return Rule(says, lambda value: isinstance(value, type) and issubclass(value, kind))
 
 
 def a_list(of: Rule) -> Rule:
-    """A list or tuple of values that a rule holds for."""
+    """A list or tuple of values for which a rule holds."""
     says = of.says.removeprefix("an ").removeprefix("a ").replace("integer", "integers", 1)
     return Rule(f"a list of {says}", lambda value: isinstance(value, (list, tuple)) and all(map(of.holds, value)))
 
@@ -82,7 +82,7 @@ FREQUENCY = integer(1) | Rule(
         and len(value) == 2
         and integer(1).holds(value[0])
         and getattr(value[1], "value", value[1]) in ("step", "episode")
-    ),  # SB3 makes it an enum
+    ),  # SB3 converts it to an enum
 )
 
 ALGORITHM: dict[str, Rule] = {
@@ -171,7 +171,9 @@ RESETS: dict[str, Rule] = {
 
 def check(name: str, value: Any, rule: Rule) -> None:
     """
-    :param name: of the argument, as it stands in the message
+    :param name: name of the argument for the message
+    :param value: its value
+    :param rule: the rule for its values
     :raises ValueError: if the rule does not hold for the value
     """
     if not rule.holds(value):
@@ -180,10 +182,10 @@ def check(name: str, value: Any, rule: Rule) -> None:
 
 def check_arguments(values: Mapping[str, Any], rules: Mapping[str, Rule], prefix: str = "") -> None:
     """
-    :param values: by name; those without a rule are left to others
+    :param values: values by name; values without a rule are not checked
     :param rules: one of the tables above
-    :param prefix: before each name in messages
-    :raises ValueError: for the first value that is not what it must be
+    :param prefix: prefix of each name in messages
+    :raises ValueError: for the first illegal value
     """
     for name, rule in rules.items():
         if name in values:

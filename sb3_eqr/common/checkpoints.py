@@ -1,4 +1,4 @@
-"""Checkpoints: everything that training needs to continue exactly, as one folder that is complete or absent."""
+"""Checkpoints: everything needed to resume training exactly, in one folder that is complete or absent."""
 
 import errno
 import hashlib
@@ -21,7 +21,7 @@ from sb3_eqr.common.files import atomic_folder, checksum, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
 
-PREFIX = "checkpoint-"  # and the step
+PREFIX = "checkpoint-"  # followed by the step
 MANIFEST, MODEL, BUFFER, ENVIRONMENT = "manifest.json", "model.zip", "replay_buffer.pkl", "environment.json"
 
 
@@ -29,19 +29,20 @@ def write_checkpoint(
     folder: pathlib.Path, model: BaseAlgorithm, notes: Any = None, keep: int = 1, with_buffer: bool = True
 ) -> pathlib.Path:
     """
-    Call it between two rollouts: a callback's ``_on_rollout_start``. One of the same step stays as it is.
+    Write a checkpoint. Call this between two rollouts, in a callback's ``_on_rollout_start``. A checkpoint of the same step is
+    not overwritten.
 
-    :param folder: of checkpoints
+    :param folder: folder of the checkpoints
     :param model: an off-policy agent
-    :param notes: anything else to keep, as plain data
-    :param keep: how many of the last checkpoints stay, this one included
-    :param with_buffer: whether the replay buffer is needed any more
-    :return: the checkpoint
+    :param notes: additional plain data to store
+    :param keep: number of checkpoints to keep, including this one
+    :param with_buffer: whether to include the replay buffer
+    :return: path of the checkpoint
     """
     env = model.get_env()
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
-    remove_leftovers(folder, f"{PREFIX}*")  # of other steps, too: nobody may come there again
+    remove_leftovers(folder, f"{PREFIX}*")  # also of other steps, which may never be written again
     with _last_named(folder), atomic_folder(checkpoint) as partial:
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -52,7 +53,7 @@ def write_checkpoint(
             "algorithm": type(model).__name__,
             "num_timesteps": model.num_timesteps,
             "settings": settings_of(model),
-            "hidden": hidden,  # what of the environment cannot be restored
+            "hidden": hidden,  # state of the environment that cannot be restored
             "rng": encode(get_rng_state(model.action_space)),
             "notes": encode(notes),
             "sha256": {path.name: checksum_of(path) for path in sorted(partial.iterdir())},
@@ -64,20 +65,20 @@ def write_checkpoint(
 
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
-    """The arguments of an agent that are plain values, by which its run is distinguished from another one."""
+    """The arguments of an agent that are plain values, used to distinguish its run from others."""
     found = {name: getattr(model, name, None) for name in ALGORITHM if name not in ("verbose", "tensorboard_log")}
     return {name: value for name, value in found.items() if isinstance(value, (bool, int, float, str))}
 
 
 @contextmanager
 def _last_named(folder: pathlib.Path) -> Iterator[None]:
-    """Where the disk is full, say which checkpoint is left."""
+    """If the disk is full, add the last complete checkpoint to the error message."""
     try:
         yield
     except OSError as error:
         if error.errno != errno.ENOSPC or not (left := find_checkpoints(folder)):
             raise
-        raise OSError(errno.ENOSPC, f"{error.strerror}. The last checkpoint, {left[-1].name}, is whole") from error
+        raise OSError(errno.ENOSPC, f"{error.strerror}. The last checkpoint, {left[-1].name}, is complete") from error
 
 
 def checksum_of(path: pathlib.Path) -> str:
@@ -87,20 +88,20 @@ def checksum_of(path: pathlib.Path) -> str:
 
 
 def digest(manifest: dict[str, Any]) -> str:
-    """SHA-256 of what stands in a manifest beside it."""
+    """SHA-256 of a manifest without its digest."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def find_checkpoints(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Complete checkpoints of a folder, the last one last."""
+    """Complete checkpoints in a folder, in order of steps."""
     return sorted(path for path in folder.glob(f"{PREFIX}*") if (path / MANIFEST).is_file())
 
 
 def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     """
-    :param path: a checkpoint, or a folder of checkpoints, whose last one is taken
-    :return: the checkpoint and what stands in its manifest
-    :raises ValueError: if there is none, or a file of it has changed
+    :param path: a checkpoint, or a folder of checkpoints, whose last one is used
+    :return: the checkpoint and the contents of its manifest
+    :raises ValueError: if there is no checkpoint, or one of its files has changed
     """
     remove_leftovers(path, f"{PREFIX}*")
     found = path if (path / MANIFEST).is_file() else next(reversed(find_checkpoints(path)), None)
@@ -115,16 +116,16 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError) as error:
         raise ValueError(f"{found} must be a complete checkpoint, got {error!r}. Use an earlier one.") from error
     if changed:
-        raise ValueError(f"{found} must be as it was written, got changes in {', '.join(changed)}. Use an earlier checkpoint.")
+        raise ValueError(f"{found} must be unchanged, got changes in {', '.join(changed)}. Use an earlier checkpoint.")
     return found, manifest
 
 
 def restore_environment(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bool) -> None:
     """
-    Put an environment, built as the one of the checkpoint, into its state; or its vectorised wrappers alone, such as the
-    statistics of VecNormalize.
+    Restore the state of an environment that is built like that of the checkpoint; with ``wrappers_only``, restore only the
+    state of its vectorised wrappers, such as the statistics of VecNormalize.
     """
-    env.reset()  # some make their attributes only now
+    env.reset()  # some environments create their attributes only here
     state = json.loads((checkpoint / ENVIRONMENT).read_text(encoding="utf-8"))
     innermost = state
     while innermost.get("venv") is not None:
@@ -136,30 +137,31 @@ def restore_environment(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bo
 
 
 def restore_generators(model: BaseAlgorithm, manifest: dict[str, Any]) -> None:
-    """The random generators, as they were."""
+    """Restore the state of the random generators."""
     set_rng_state(decode(manifest["rng"]), model.action_space)
 
 
 def warn_of_hidden(checkpoint: pathlib.Path, manifest: dict[str, Any]) -> None:
-    """Say that a run does not continue exactly."""
+    """Warn that a run is not resumed exactly."""
     warnings.warn(
-        f"{checkpoint}: the environment has a state that cannot be saved ({', '.join(manifest['hidden'][:3])}): "
-        "training continues with new episodes, not bit for bit as if it had not stopped."
+        f"{checkpoint}: part of the environment's state cannot be saved ({', '.join(manifest['hidden'][:3])}), "
+        "so training resumes with new episodes and does not continue bit for bit."
     )
 
 
 class ExactCheckpointCallback(BaseCallback):
     """
-    Checkpoints from which ``resume`` continues bit for bit: model, replay buffer, VecNormalize, the environments' states and
-    the random generators, as one folder ``checkpoint-<step>`` that is complete or absent. They are written before a rollout,
-    at the first such moment after every ``save_freq`` steps: none at the very end, and with ``train_freq=128`` at multiples
-    of 128.
+    Saves checkpoints from which ``resume`` continues bit for bit: model, replay buffer, VecNormalize, the environments' states
+    and the random generators, in one folder ``checkpoint-<step>`` that is complete or absent. A checkpoint is written at the
+    start of the first rollout after every ``save_freq`` steps, so never at the very end of training, and with
+    ``train_freq=128`` only at multiples of 128.
 
     :param save_freq: steps of all environments between two checkpoints, ≥ 1
-    :param save_path: folder for them
-    :param keep: how many of the last ones stay, ≥ 1
-    :param verbose: 1 prints where each is written
-    :raises ValueError: for an argument out of its range; when ``learn`` begins, for a folder with checkpoints of another run
+    :param save_path: folder for the checkpoints
+    :param keep: number of latest checkpoints to keep, ≥ 1
+    :param verbose: 1 prints the path of each checkpoint
+    :raises ValueError: if an argument is out of range, or, at the start of ``learn``, if the folder holds checkpoints of
+        another run
     """
 
     def __init__(self, save_freq: int, save_path: str | pathlib.Path, keep: int = 2, verbose: int = 0):
@@ -175,23 +177,23 @@ class ExactCheckpointCallback(BaseCallback):
         self._last = self.num_timesteps // self.save_freq
         if not hasattr(self.model, "resume"):
             raise ValueError(
-                "ExactCheckpointCallback: expected an agent of this package, which can resume, found "
+                "ExactCheckpointCallback: the agent must be one of this package, which can resume, got "
                 f"{type(self.model).__name__}. Use SB3's CheckpointCallback."
             )
         self._check_folder()
 
     def _check_folder(self) -> None:
-        """Two runs in one folder would take each other's checkpoints for their own."""
+        """Raise ValueError if the folder holds checkpoints of another run, which would be mixed up with those of this run."""
         old = find_checkpoints(self.save_path)
         manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)
         other = [name for name in theirs if theirs[name] != ours.get(name)]
         is_behind = self.model.seed is None and manifest.get("num_timesteps", 0) > self.model.num_timesteps
         if other or is_behind:
-            why = f"{other[0]} = {theirs[other[0]]!r} there, {ours.get(other[0])!r} here" if other else "this one has no seed"
+            why = f"{other[0]} = {theirs[other[0]]!r} there, {ours.get(other[0])!r} here" if other else "this run has no seed"
             raise ValueError(
-                f"{self.save_path} must be empty or hold checkpoints of this run, got those of another one ({why}). "
-                "Pass another folder, or continue that run with resume."
+                f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
+                "Pass another folder, or resume that run."
             )
 
     def _on_rollout_start(self) -> None:

@@ -1,7 +1,7 @@
 """
-Loss terms and gradients of an update as one CUDA graph: one launch where eager PyTorch makes some thousand.
+Loss terms and gradients of an update captured as one CUDA graph: one launch instead of about a thousand.
 
-Experimental: it has not been measured on a GPU yet. All that this package knows of CUDA graphs is in this file.
+Experimental: it has not been measured on a GPU yet. All code for CUDA graphs is in this file.
 """
 
 import warnings
@@ -18,16 +18,16 @@ from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 class CapturedGradients:
     """
-    Computes an objective and its gradients. On a GPU the first calls run eagerly, while libraries allocate what they keep;
-    then one call is captured, and the following ones replay it on their own samples. Whatever else the graph depends on
+    Computes an objective and its gradients. On a GPU, the first calls run eagerly, while libraries allocate their workspaces;
+    then one call is captured, and later calls replay it with their own samples. Everything else that the graph depends on
     (weights of the loss terms, shapes, which parameters are trained) is compared at each call, and the graph is captured
-    again if it has changed. Without a GPU, or if a capture fails, every call runs eagerly, with one warning.
+    again if it has changed. Without a GPU, or if a capture fails, all calls run eagerly, after one warning.
 
-    The objective must not read a number back from the GPU, as a matrix exponential does.
+    The objective must not read values back from the GPU, as a matrix exponential does.
 
-    :param objective: a function of samples and coefficients; what it returns has the scalar ``loss``, which is minimised
+    :param objective: a function of samples and coefficients; its result has the scalar ``loss``, which is minimised
     :param policy: the networks that it evaluates
-    :param parameters: what is trained; their ``grad`` must be ``None`` at each call
+    :param parameters: the trained parameters; their ``grad`` must be ``None`` at each call
     """
 
     WARM_UP = 3  # eager calls before the capture
@@ -43,9 +43,9 @@ class CapturedGradients:
         self._parameters = parameters
         self._device = parameters[0].device
         self._key: Hashable = None
-        self._calls = 0  # with this key
+        self._calls = 0  # number of calls with this key
         self._graph: th.cuda.CUDAGraph | None = None
-        self.failure: str | None = None  # why nothing is captured
+        self.failure: str | None = None  # the reason why nothing is captured
         if self._device.type != "cuda":
             self._give_up(f"a CUDA graph needs a GPU, and the device is {self._device.type!r}")
 
@@ -74,7 +74,7 @@ class CapturedGradients:
         return self._terms
 
     def _key_of(self, samples: SequenceReplayBufferSamples, coefs: Hashable) -> Hashable:
-        """Everything that a graph of one call would hold on to."""
+        """Everything on which a captured graph depends."""
         return (
             coefs,
             self._policy.target_encodes_as_online,
@@ -89,7 +89,7 @@ class CapturedGradients:
         return terms
 
     def _beside(self, coefs: Hashable) -> Any:
-        """Eagerly on a stream of its own, as a capture wants the calls before it to have run."""
+        """Run eagerly on a side stream, as required for the calls before a capture."""
         current, beside = th.cuda.current_stream(self._device), th.cuda.Stream(self._device)
         beside.wait_stream(current)
         with th.cuda.stream(beside):
@@ -98,14 +98,14 @@ class CapturedGradients:
         return terms
 
     def _capture(self, coefs: Hashable) -> bool:
-        """Record a call, which computes nothing yet; whether that worked."""
+        """Capture a call, without executing it, and return whether this succeeded."""
         graph = th.cuda.CUDAGraph()
         try:
-            # A capture that fails may leave its stream current: the outer context restores this one.
+            # A failed capture may leave its stream current, so the outer context restores this one.
             with th.cuda.device(self._device), th.cuda.stream(th.cuda.current_stream(self._device)), th.cuda.graph(graph):
                 self._terms = self._eager(self._inputs, coefs)
         except Exception as error:  # PyTorch raises several kinds
-            while error.__context__ is not None:  # the first failure is the cause, those after it follow from it
+            while error.__context__ is not None:  # the first failure is the cause, later ones follow from it
                 error = error.__context__  # type: ignore[assignment]
             for parameter in self._parameters:
                 parameter.grad = None
@@ -120,7 +120,7 @@ class CapturedGradients:
         warnings.warn(f"cuda_graph: updates run eagerly, because {why}.")
 
     def __getstate__(self) -> dict[str, Any]:
-        # A graph belongs to its process.
+        # A graph cannot be moved to another process.
         return {"objective": self._objective, "policy": self._policy, "parameters": self._parameters}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -135,7 +135,7 @@ def _tensors(samples: SequenceReplayBufferSamples) -> Iterator[th.Tensor]:
 
 
 def _copied(samples: SequenceReplayBufferSamples) -> SequenceReplayBufferSamples:
-    """The same in tensors of their own, which a graph reads."""
+    """A copy of the samples in separate tensors, which the graph reads."""
     copies: dict[str, Any] = {}
     for name, field in samples._asdict().items():
         if isinstance(field, dict):

@@ -1,6 +1,6 @@
 """
-The state of environments as plain data, and back into environments that were built alike. On the way back no object is made
-and nothing is executed: numbers, arrays and the states of random generators are put where they were.
+Capturing the state of environments as plain data, and restoring it into environments that were built alike. Restoring creates
+no objects and executes no code; it only sets numbers, arrays and the states of random generators.
 """
 
 import io
@@ -17,19 +17,19 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.plain_data import KIND, decode, encode
 
-# What stays as it was built: definitions, and ways out of the program.
+# Values that are not captured: definitions, and handles to the outside such as files and loggers.
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
 FIXED += (spaces.Space, np.dtype, io.IOBase, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
-CLASS = ":class:"  # the name of an object's class
+CLASS = ":class:"  # key of the name of an object's class
 PLAIN = (bool, int, float, str, bytes, np.generic)
 
 
 def capture(root: Any) -> tuple[Any, list[str]]:
     """
     :param root: an environment, vectorised or not, with all its wrappers
-    :return: its state as JSON, and the paths of what has a state that Python does not show, such as a physics engine's: none
-        if the state is complete
+    :return: its state as JSON, and the paths of objects whose state is not accessible from Python, such as a physics engine;
+        empty if the state is complete
     """
     hidden: list[str] = []
     return _capture(root, "", set(), hidden), hidden
@@ -37,9 +37,9 @@ def capture(root: Any) -> tuple[Any, list[str]]:
 
 def restore(root: Any, state: Any) -> None:
     """
-    :param root: built as the one whose state it is
-    :param state: of :func:`capture`
-    :raises ValueError: if it was built otherwise
+    :param root: an environment built like the captured one
+    :param state: state returned by :func:`capture`
+    :raises ValueError: if the environment was built differently
     """
     _restored(root, state, type(root).__name__)
 
@@ -47,7 +47,7 @@ def restore(root: Any, state: Any) -> None:
 def _capture(value: Any, path: str, seen: set[int], hidden: list[str]) -> Any:
     if value is None or (isinstance(value, np.ndarray) and value.dtype != object) or isinstance(value, PLAIN):
         return {KIND: "plain", "value": encode(value.hex()) if isinstance(value, bytes) else encode(value)}
-    if isinstance(value, FIXED) or id(value) in seen:  # what was met before is captured there
+    if isinstance(value, FIXED) or id(value) in seen:  # an object is captured where it is first encountered
         return None
     seen.add(id(value))
     if isinstance(value, (np.random.Generator, np.random.RandomState)):
@@ -64,13 +64,13 @@ def _capture(value: Any, path: str, seen: set[int], hidden: list[str]) -> Any:
         hidden.append(path)
         return None
     children = {name: child for name, child in vars(value).items() if name not in SKIPPED}
-    kind = {CLASS: type(value).__name__} if isinstance(value, VecEnv) else {}  # packages replace wrappers of gymnasium
+    kind = {CLASS: type(value).__name__} if isinstance(value, VecEnv) else {}  # gymnasium's wrappers may be substituted
     found = {name: _capture(child, f"{path}.{name}", seen, hidden) for name, child in children.items()}
     return {KIND: "attributes", **kind, **found}
 
 
 def _restored(current: Any, state: Any, path: str) -> Any:
-    """What stands where ``current`` stood; objects stay and get their attributes, arrays their contents."""
+    """The restored value for ``current``; objects and arrays are updated in place where possible."""
     return current if state is None else HANDLERS[state[KIND]](current, state, path)
 
 
@@ -80,7 +80,7 @@ def _restored_plain(current: Any, state: Any, path: str) -> Any:
         return bytes.fromhex(found)
     if isinstance(found, np.ndarray) and isinstance(current, np.ndarray) and current.flags.writeable:
         if (found.shape, found.dtype) == (current.shape, current.dtype):
-            current[...] = found  # others may look at the same memory
+            current[...] = found  # other objects may share this memory
             return current
     return found
 
@@ -104,8 +104,8 @@ def _restored_attributes(current: Any, state: Any, path: str) -> Any:
     if current is None or (expected is not None and found != expected):
         raise ValueError(
             f"{path} must be {'an object' if expected is None else f'a {expected}'}, "
-            f"got {'nothing' if current is None else found}: the environment is not built as in the run that is resumed. "
-            "Pass one with the same wrappers, VecNormalize included."
+            f"got {'nothing' if current is None else found}: the environment is not built as in the original run. "
+            "Pass one with the same wrappers, including VecNormalize."
         )
     for name, child in state.items():
         if name not in (KIND, CLASS):

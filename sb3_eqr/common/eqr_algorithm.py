@@ -1,4 +1,4 @@
-"""The algorithm: its arguments, what it is made of, and the one training loop of every EqR agent (Algorithm 1)."""
+"""The algorithm: arguments, components and training loop of all EqR agents (Algorithm 1)."""
 
 import inspect
 import io
@@ -31,15 +31,16 @@ from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
-# Arguments of the replay buffer that are arguments of the algorithm, which moves them.
+# Arguments of the replay buffer that the algorithm sets and changes.
 SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
 MAX_LEARNING_STARTS = 2_000  # Table 5, of 100,000 steps
 
 
 class EqRAlgorithm(FiniteData, SafeFiles):
     """
-    Mixin, to stand before an SB3 Q-learning algorithm: replay of windows, auxiliary losses beside the TD loss, one backward,
-    one clip, one step, the target, the priorities. The head and its loss are those of the policy's networks.
+    Mixin, listed before an SB3 Q-learning algorithm. Each update samples windows, adds the auxiliary losses to the TD loss,
+    makes one backward pass, one gradient clipping and one optimiser step, and updates targets and priorities. The policy's
+    networks define the Q head and its loss.
     """
 
     policy: EqRPolicy
@@ -53,7 +54,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     exploration_final_eps: float
     exploration_fraction: float
     _n_calls: int
-    _create_aliases: Callable[[], None]  # of the stock algorithm: its own names of the networks
+    _create_aliases: Callable[[], None]  # from the SB3 algorithm: its own names of the networks
     frame_stack = 1
 
     @validation.answers_misspelt(policy_kwargs=EqRPolicy, replay_buffer_kwargs=PrioritizedSequenceReplayBuffer)
@@ -99,46 +100,48 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         _init_setup_model: bool = True,
     ):
         """
-        Default hyperparameters are those of the paper for Atari 100K (Table 5: sums over 5 steps there, means here).
+        The defaults are the paper's hyperparameters for Atari 100K (Table 5; losses are sums over 5 steps there, means here).
 
         :param policy: The policy model to use, by its name ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") or its class
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete
         :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
         :param buffer_size: size of the replay buffer, over all environments; per environment at least n + M + 1
         :param learning_starts: how many steps of the model to collect transitions for before learning starts; ``None``: a
-            tenth of the first call of ``learn``, at most the paper's 2,000 (Table 5)
+            tenth of the steps of the first call of ``learn``, at most the paper's 2,000 (Table 5)
         :param batch_size: Minibatch size for each gradient update
-        :param tau: how far the target moves at each target update, in [0, 1]; 1 copies the online networks
+        :param tau: the update coefficient of the target networks, in [0, 1]; 1 copies the online networks
         :param gamma: the discount factor
         :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
             like ``(5, "step")`` or ``(2, "episode")``.
         :param gradient_steps: How many gradient steps to do after each rollout; -1: as many as steps done in the environment
-        :param replay_buffer_class: a class derived from ``SequenceReplayBuffer``; ``None``: chosen by ``prioritized_replay``
+        :param replay_buffer_class: a subclass of ``SequenceReplayBuffer``; ``None``: ``prioritized_replay`` selects it
         :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation: ``alpha``, ``beta`` and
             ``final_beta`` of :class:`~sb3_eqr.common.replay.buffers.PrioritizedSequenceReplayBuffer`; ``frame_stack``, how
-            many frames an image observation stacks (found where ``VecFrameStack`` is used)
-        :param optimize_memory_usage: has no effect, with a warning: each frame is stored once in any case
+            many frames an image observation stacks (detected if ``VecFrameStack`` is used)
+        :param optimize_memory_usage: has no effect and causes a warning: each frame is always stored only once
         :param n_steps: n of the n-step return
-        :param target_update_interval: environment steps between two target updates, as in QRDQN; ``None``: each gradient step
-        :param exploration_fraction: fraction of training over which the exploration rate falls; then noisy layers explore
-        :param exploration_initial_eps: initial value of random action probability; above 1: random until it falls below
+        :param target_update_interval: environment steps between target updates, as in QRDQN; ``None``: every gradient step
+        :param exploration_fraction: fraction of training over which the exploration rate is reduced; then noisy layers explore
+        :param exploration_initial_eps: initial value of random action probability; above 1: all actions are random until it
+            falls below 1
         :param exploration_final_eps: final value of random action probability
-        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all that is trained
-        :param prediction_depth: M, how many steps ahead the latent model predicts; 0 switches the auxiliary losses off
-        :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 switches it off
-        :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 switches it off
-        :param reward_coef: λ₁ ≥ 0, weight of the reward loss, likewise; 0 switches it off
-        :param td_coef: ≥ 0, weight of the TD loss; 0: no Q-learning, the representation alone is trained, priorities stay
-        :param aux_gradient_share: largest norm of the auxiliary losses' gradient at the state, as a share of that of the TD
-            loss, ≥ 0: they are scaled down there where they exceed it; ``None``: no limit
-        :param double_q: choose the next action by the online network (van Hasselt et al. 2016)
-        :param prioritized_replay: draw by priority and weight every loss (Schaul et al. 2016); else uniformly
-        :param shift_pixels: random shift of images, in pixels; 0 switches it off
-        :param intensity_scale: random intensity of images; 0 switches it off
-        :param resets: periodic resets, and n and γ that are annealed: a :class:`~sb3_eqr.common.resets.ResetSchedule`, or
+        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all trained parameters
+        :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
+        :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 disables it
+        :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 disables it
+        :param reward_coef: λ₁ ≥ 0, weight of the reward loss, a mean over steps; 0 disables it
+        :param td_coef: weight of the TD loss, ≥ 0; 0: train only the representation, without Q-learning and with constant
+            priorities
+        :param aux_gradient_share: maximum norm of the auxiliary losses' gradient at the features, as a share of the TD
+            gradient's norm, ≥ 0; a larger gradient is scaled down. ``None``: no limit
+        :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
+        :param prioritized_replay: whether to sample by priority and weight all losses (Schaul et al. 2016), or uniformly
+        :param shift_pixels: random shift of images, in pixels; 0 disables it
+        :param intensity_scale: random intensity of images; 0 disables it
+        :param resets: periodic resets, and annealing of n and γ: a :class:`~sb3_eqr.common.resets.ResetSchedule`, or
             its fields as a dictionary; ``None``: neither
-        :param cuda_graph: experimental, and not measured on a GPU yet: losses and gradients of an update as one CUDA graph,
-            with the same numbers but for rounding (:mod:`sb3_eqr.common.cuda_graph`); a warning says why it falls back
+        :param cuda_graph: experimental, and not measured on a GPU yet: capture losses and gradients of an update as one CUDA
+            graph, with the same results up to rounding (:mod:`sb3_eqr.common.cuda_graph`); warns if it runs eagerly instead
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation, see
@@ -148,16 +151,16 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param device: Device (cpu, cuda, ...) on which the code should be run.
             Setting it to auto, the code will be run on the GPU if possible.
         :param _init_setup_model: Whether or not to build the network at the creation of the instance
-        :raises ValueError: for an argument out of its range
-        :raises TypeError: for an argument that there is not, with the nearest one that there is
-        :raises AssertionError: if the action space is not Discrete (as SB3)
+        :raises ValueError: if an argument is out of range
+        :raises TypeError: if an argument is unknown; the message suggests the nearest name
+        :raises AssertionError: if the action space is not Discrete (as in SB3)
         """
         check_arguments(locals(), ALGORITHM)
         check_arguments(policy_kwargs or {}, POLICY)
         validation.check_device(device)
         if optimize_memory_usage:
-            warnings.warn("optimize_memory_usage=True has no effect: the replay buffer stores each frame once in any case.")
-        policy_kwargs = dict(policy_kwargs or {})  # SB3 fills in what it is given: the caller's is left alone
+            warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each frame only once.")
+        policy_kwargs = dict(policy_kwargs or {})  # a copy, because SB3 changes it
         set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]
             policy,
@@ -198,14 +201,14 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.intensity_scale = intensity_scale
         self.resets = resets
         self.cuda_graph = cuda_graph
-        self.policy_description: dict[str, str] = {}  # saved beside the parameters, see EqRPolicy.description
-        self.representation_frozen = False  # by load_representation; survives saving
-        self._resets = Resets(ResetSchedule.of(resets))  # survives saving
+        self.policy_description: dict[str, str] = {}  # saved with the model, see EqRPolicy.description
+        self.representation_frozen = False  # set by load_representation; saved with the model
+        self._resets = Resets(ResetSchedule.of(resets))  # saved with the model
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
-        """In place of SB3's, in its order: that one refuses n-step replay of dicts and a target per gradient step."""
+        """As SB3's, but supports n-step replay of dicts and a target update per gradient step."""
         self._check_arguments()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -242,15 +245,15 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
         noisy = self.policy_kwargs.get("noisy", True)
-        if self.exploration_final_eps == 0 and not noisy and self.resets.interval is None:  # resets explore, too
+        if self.exploration_final_eps == 0 and not noisy and self.resets.interval is None:  # resets also cause exploration
             warnings.warn(
-                "exploration_final_eps=0 and noisy=False: after the first steps the agent acts greedily. "
-                "Pass exploration_final_eps=0.01, say, or leave the noisy layers on."
+                "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
+                "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
             )
 
     @property
     def depth(self) -> int:
-        """M as it is used: 0 where no auxiliary loss is on."""
+        """The effective M: 0 if all auxiliary losses are disabled."""
         return self.prediction_depth if self.aet_coef or self.symmetry_coef or self.reward_coef else 0
 
     @staticmethod
@@ -271,7 +274,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         legal = inspect.signature(buffer_class).parameters
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in legal.values()):
             validation.check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
-        longest = max(self.n_steps, self._resets.schedule.initial_n_steps or 0)  # that it must hold
+        longest = max(self.n_steps, self._resets.schedule.initial_n_steps or 0)  # the buffer must be able to hold it
         kwargs: dict[str, Any] = {"n_steps": longest, "gamma": self.gamma, "prediction_depth": self.depth}
         kwargs |= {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack, "n_envs": self.n_envs}
         return buffer_class(self.buffer_size, self.observation_space, self.action_space, self.device, **kwargs)
@@ -280,13 +283,13 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         stack: Any = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
         found = 1
         if stack is not None and is_image_space(self.observation_space):
-            # Frames lie side by side along the first axis only if channels were what was stacked.
+            # The first axis consists of frames only if VecFrameStack stacked along the channels.
             if stack.stacked_obs.channels_first == is_image_space_channels_first(stack.venv.observation_space):
                 found = stack.stacked_obs.n_stack
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        check_arguments(vars(self), ALGORITHM)  # attributes may have been set since
+        check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
         result = super()._setup_learn(*args, **kwargs)
         if self.learning_starts is None:
             self.learning_starts = min(self._total_timesteps // 10, MAX_LEARNING_STARTS)
@@ -294,7 +297,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         return result
 
     def _on_step(self) -> None:
-        """Called after each step of the environments: move the exploration rate, and the target if it goes by such steps."""
+        """Called after each environment step: update the exploration rate, and the target if its interval is in such steps."""
         self._n_calls += 1
         if self.target_update_interval and self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
             self.policy.update_target(self.tau)
@@ -303,12 +306,12 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last round may end beyond the total, where a linear schedule gives a learning rate below 0: gradient ascent.
+        # The last rollout may exceed the total number of steps, where a linear schedule would give a negative learning rate.
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
-        A round of updates (Algorithm 1).
+        Make a round of updates (Algorithm 1).
 
         :param gradient_steps: number of updates
         :param batch_size: B
@@ -365,7 +368,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _log_last_round(self, check_model: bool = False) -> None:
-        """Log the last round's metrics, which are computed by now; roll back if one, or the model, is not finite."""
+        """Log the metrics of the last round, which are ready by now; roll back if a metric or the model is not finite."""
         try:
             for name, value in self._monitor.collect().items():
                 self.logger.record_mean(f"train/{name}", value)
@@ -385,24 +388,24 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfEqRAlgorithm:
-        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` is the name of the class where not given."""
+        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class."""
         check("total_timesteps", total_timesteps, number(0))
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
         self._log_last_round(check_model=True)
-        if log_interval is not None:  # SB3 logs when an episode ends: the updates since then are missing
+        if log_interval is not None:  # SB3 logs only at the end of episodes, so the last updates would be missing
             self.dump_logs()
         return self
 
     def dump_logs(self) -> None:
-        """Write log data; losses are means over all updates since the last time."""
+        """Write log data; losses are means over all updates since the last call."""
         self._log_last_round()
         super().dump_logs()
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """As SB3's ``set_parameters``; a file with parameters for another group or return distribution raises ValueError."""
+        """As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution."""
         if not isinstance(load_path_or_dict, dict):
             saved = read_data(load_path_or_dict).get("policy_description", {})
             validation.check_same_parameters(self.policy_description, saved)
@@ -411,31 +414,33 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         for parameter, state in self.policy.optimizer.state.items():
             for name, value in state.items():
                 if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
-                    state[name] = th.empty_like(parameter).copy_(value)  # fused kernels read both in one order
+                    state[name] = th.empty_like(parameter).copy_(value)  # fused kernels need the same memory layout
 
     def load_representation(
         self: SelfEqRAlgorithm, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False
     ) -> SelfEqRAlgorithm:
         """
-        Start from encoder, κ, ρ and b of another run, for the same observations and actions (paper, §4).
+        Load encoder, κ, ρ and b of another run with the same observations and actions (paper, §4).
 
-        :param path: what ``save`` of either agent wrote
-        :param freeze: whether they stay as they are from now on; ``aet_coef=0, symmetry_coef=0`` then saves their time
-        :raises ValueError: if it does not fit: another group, trunk or number of actions; nothing is changed then
+        :param path: file written by ``save`` of either agent
+        :param freeze: whether to freeze them; ``aet_coef=0, symmetry_coef=0`` then saves computing time
+        :return: the agent
+        :raises ValueError: if the group, the trunk or the number of actions differs; nothing is changed in this case
         """
         if freeze and self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):
             raise ValueError(
-                "freeze: expected a loss that trains something else, found td_coef=0 and no reward loss. Pass freeze=False."
+                "freeze must be False if no other parameters are trained, got True with td_coef=0 and no reward loss. "
+                "Pass freeze=False."
             )
         self._log_last_round()
         load_representation(self.policy, path)
         self.representation_frozen = freeze
         self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
-        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)  # no way back to before
+        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)  # older backups are no longer valid
         return self
 
     def _before_saving(self) -> None:
-        self._log_last_round(check_model=True)  # a model whose last update went wrong is put back and not saved
+        self._log_last_round(check_model=True)  # rolls back instead of saving a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_monitor", "_trained", "objective", "_captured"]

@@ -1,4 +1,4 @@
-"""Files and folders that are complete or absent, whoever else writes there and whenever a process is killed."""
+"""Atomic writes: files and folders are complete or absent, even with concurrent writers and killed processes."""
 
 import contextlib
 import errno
@@ -16,21 +16,21 @@ from typing import BinaryIO
 
 try:
     import fcntl
-except ImportError:  # Windows: leftovers of killed processes stay there
+except ImportError:  # Windows, where leftovers of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
 
-SEAL = b"sha256:"  # and the digits: the comment of a sealed zip file
+SEAL = b"sha256:"  # followed by the digits: the comment of a sealed zip file
 
 
 @contextmanager
 def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
     """
-    A file opened beside ``path`` that takes its place only once it is complete and on the disk. Of two writers the last one
-    wins. What killed ones have left beside ``path`` is removed.
+    Open a temporary file next to ``path`` that replaces it once it is complete and on disk. If there are two writers, the
+    last one wins. Leftovers of killed writers are removed.
 
-    :param path: destination; ``suffix`` is appended where it has none, and its folder is made, as SB3 does
-    :param suffix: without the dot
+    :param path: destination; ``suffix`` is appended if it has none, and its folder is created, as in SB3
+    :param suffix: file extension without the dot
     """
     path = pathlib.Path(path)
     if path.suffix == "":
@@ -57,20 +57,20 @@ def checksum(file: BinaryIO, size: int) -> str:
 
 def seal(file: BinaryIO) -> None:
     """
-    Give a zip file without a comment the checksum of all its bytes as one. The checksums of the format leave out its headers.
+    Append the checksum of all bytes to a zip file as its comment, because the checksums of the format do not cover headers.
 
     :param file: open for reading and writing
     """
-    end = file.seek(-2, os.SEEK_END) + 2  # the length of the comment stands there
+    end = file.seek(-2, os.SEEK_END) + 2  # the last two bytes hold the length of the comment
     file.write(struct.pack("<H", len(SEAL) + 64))
     file.write(SEAL + checksum(file, end).encode())
 
 
 def is_unbroken(file: BinaryIO) -> bool:
-    """Whether a zip file, open for reading, is as it was sealed; one without a comment never was."""
+    """Whether a zip file, open for reading, is unchanged since it was sealed; files without a comment count as unchanged."""
     try:
         comment = zipfile.ZipFile(file).comment
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # of damaged headers
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error):  # raised for damaged headers
         return False
     end = file.seek(0, os.SEEK_END) - len(comment)
     return comment in (b"", SEAL + checksum(file, end).encode())
@@ -79,8 +79,8 @@ def is_unbroken(file: BinaryIO) -> bool:
 @contextmanager
 def atomic_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """
-    A new folder beside ``path`` that takes its name only once it is complete and on the disk. If there is a ``path`` by then,
-    that one stays.
+    Create a temporary folder next to ``path`` that is renamed to it once it is complete and on disk. If ``path`` exists by
+    then, it is kept.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with _partial(path, is_folder=True) as partial:
@@ -98,12 +98,12 @@ def atomic_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
 @contextmanager
 def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
     """
-    An empty file or folder beside ``path`` whose name nobody else has, gone afterwards. As long as it is written, its process
-    holds a lock of it: one without a lock is a leftover.
+    Create an empty file or folder next to ``path`` with a unique name, and remove it afterwards. Its process holds a lock on
+    it while writing, so one without a lock is a leftover.
     """
     remove_leftovers(path.parent, glob.escape(path.name))
     descriptor = None
-    while descriptor is None:  # it may be taken for a leftover before it is locked
+    while descriptor is None:  # another process may mistake it for a leftover before it is locked
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
         partial.mkdir() if is_folder else partial.touch()
         with contextlib.suppress(FileNotFoundError):
@@ -121,7 +121,7 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
 
 @contextmanager
 def _full_disk_named(path: pathlib.Path) -> Iterator[None]:
-    """What a full disk makes of a write, PyTorch's errors included, as an OSError that says what is left."""
+    """Convert any error caused by a full disk, including PyTorch's, into an OSError that states what is left of ``path``."""
     try:
         yield
     except Exception as error:
@@ -130,16 +130,16 @@ def _full_disk_named(path: pathlib.Path) -> Iterator[None]:
             cause = cause.__context__
         if cause is None:
             raise
-        state = "is as it was" if path.exists() else "was not written"
+        state = "is unchanged" if path.exists() else "was not written"
         raise OSError(errno.ENOSPC, f"No space left on the disk of {path.parent}: {path.name} {state}") from error
 
 
 def remove_leftovers(folder: pathlib.Path, names: str) -> None:
     """
-    Remove what killed processes have left in a folder; what is being written is locked, and stays.
+    Remove leftovers of killed processes from a folder; files being written are locked and kept.
 
-    :param folder: where they wrote
-    :param names: of what they wrote, as a pattern
+    :param folder: folder to clean
+    :param names: glob pattern for the names of the files or folders that they wrote
     """
     for leftover in folder.glob(f".{names}.*.partial"):
         with contextlib.suppress(OSError):
@@ -156,7 +156,7 @@ def _open(path: pathlib.Path) -> int:
 
 
 def _lock(descriptor: int) -> bool | None:
-    """Whether the lock is ours now; ``None`` if there are no locks on this system or in this folder."""
+    """Try to lock, and return whether it succeeded; ``None`` if this system or folder does not support locks."""
     try:
         if fcntl is not None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -176,7 +176,7 @@ def _remove(path: pathlib.Path) -> None:
 
 
 def _sync(path: pathlib.Path) -> None:
-    """Onto the disk; Windows has no such call for folders."""
+    """Flush to disk; Windows does not support this for folders."""
     with contextlib.suppress(PermissionError):
         descriptor = _open(path)
         try:

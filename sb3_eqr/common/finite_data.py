@@ -1,4 +1,4 @@
-"""What environments and users hand in must be finite, or nothing of it is stored, learned or normalised with."""
+"""Rejects data from environments and users that are not finite, before they are stored or used."""
 
 import warnings
 from typing import Any
@@ -10,17 +10,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_eqr.common.validation import check_finite, environment_errors, find_infinite
 
-STATISTICS = ("obs_rms", "ret_rms")  # of VecNormalize
+STATISTICS = ("obs_rms", "ret_rms")  # attributes of VecNormalize
 
 
 class FiniteData(OffPolicyAlgorithm):
     """
-    Mixin: refuses observations, rewards and terminal observations that are NaN or infinite, in training and in ``predict``. A
-    refused step leaves the replay buffer and the statistics of VecNormalize as they were.
+    Mixin that rejects observations, rewards and terminal observations that are NaN or infinite, in training and in
+    ``predict``. A rejected step does not change the replay buffer and the statistics of VecNormalize.
     """
 
-    trained_normalized = False  # whether the last environment was behind VecNormalize; survives saving
-    _statistics: dict[str, Any] | None = None  # of the last step that was accepted
+    trained_normalized = False  # whether the last environment was wrapped in VecNormalize; saved with the model
+    _statistics: dict[str, Any] | None = None  # VecNormalize's statistics after the last accepted step
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         self._warn_without_normalization()
@@ -31,21 +31,21 @@ class FiniteData(OffPolicyAlgorithm):
         return result
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
-        """As SB3's; an environment that breaks its interface is named."""
+        """As SB3's ``collect_rollouts``; errors state if an environment violates gymnasium's interface."""
         with environment_errors(self.num_timesteps):
             return super().collect_rollouts(*args, **kwargs)
 
     def _warn_without_normalization(self) -> None:
-        """Once trained behind VecNormalize, an agent that sees raw observations acts at random."""
+        """Warn if an agent trained with VecNormalize would now get raw observations, with which its actions are useless."""
         counts = (
             [part.count for part in _parts(self._vec_normalize_env, "obs_rms").values()] if self._vec_normalize_env else []
         )
-        is_new = bool(counts) and max(counts) < 1  # it has seen nothing yet
+        is_new = bool(counts) and max(counts) < 1  # it has no statistics yet
         if self.trained_normalized and (self._vec_normalize_env is None or is_new):
-            found = "that VecNormalize is new" if is_new else "its environment is not"
+            found = "this VecNormalize has no statistics yet" if is_new else "this environment is not wrapped in it"
             warnings.warn(
-                f"This agent was trained behind VecNormalize, and {found}: it sees other numbers than it knows. "
-                "Pass VecNormalize.load(path, venv) as env, with the statistics that were saved beside the model."
+                f"This agent was trained with VecNormalize, but {found}, so observations are scaled differently. "
+                "Pass VecNormalize.load(path, venv) as env, with the statistics that were saved with the model."
             )
         self.trained_normalized = self._vec_normalize_env is not None
 
@@ -58,7 +58,7 @@ class FiniteData(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        # What VecNormalize has clipped may hide an infinity: its originals are looked at.
+        # Check the original values, because VecNormalize's clipping may hide an infinity.
         normalize, step = self._vec_normalize_env, self.num_timesteps
         try:
             check_finite("observation", new_obs if normalize is None else normalize.get_original_obs(), step)
@@ -67,7 +67,7 @@ class FiniteData(OffPolicyAlgorithm):
                 check_finite("terminal observation", info.get("terminal_observation", 0), step)
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         except ValueError:
-            self._last_obs = None  # the environment has moved on: another call of learn must reset it
+            self._last_obs = None  # the environment has already stepped, so the next call of learn must reset it
             restore_statistics(normalize, self._statistics)
             raise
         self._statistics = statistics_of(normalize)
@@ -79,7 +79,7 @@ class FiniteData(OffPolicyAlgorithm):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """As SB3's ``predict``, with the same parameters; raises ValueError for an observation that is not finite."""
+        """As SB3's ``predict``, with the same parameters; raises ValueError if the observation is not finite."""
         found = find_infinite(observation) if isinstance(observation, (np.ndarray, dict)) else None
         if found is not None:
             raise ValueError(f"observation must be finite, got {found}.")
@@ -91,22 +91,22 @@ class FiniteData(OffPolicyAlgorithm):
 
 def original_infos(normalize: VecNormalize | None) -> list[dict[str, Any]]:
     """
-    What the environments said before VecNormalize has clipped their terminal observations, which it does in place. SB3's
-    DummyVecEnv hands out copies; of other processes nothing is left, and what is clipped is finite.
+    The infos of the environments before VecNormalize clipped their terminal observations in place. Only SB3's DummyVecEnv
+    keeps them, because it returns copies; with other VecEnvs they are lost, and the clipped values are finite.
     """
     innermost = None if normalize is None else normalize.unwrapped
     return innermost.buf_infos if isinstance(innermost, DummyVecEnv) else []
 
 
 def statistics_of(normalize: VecNormalize | None) -> dict[str, Any] | None:
-    """Running means as they are; SB3 replaces their arrays and never changes them in place, so that no copy is needed."""
+    """The current running means. They need not be copied, because SB3 replaces their arrays instead of changing them."""
     if normalize is None:
         return None
     return {name: {key: dict(vars(part)) for key, part in _parts(normalize, name).items()} for name in STATISTICS}
 
 
 def restore_statistics(normalize: VecNormalize | None, statistics: dict[str, Any] | None) -> None:
-    """The way back from what a refused step has done to running means."""
+    """Undo the changes of a rejected step to the running means."""
     if normalize is None or statistics is None:
         return
     for name, saved in statistics.items():

@@ -1,6 +1,6 @@
 """
-Python values as JSON and back, without executing anything: numbers, strings, containers, arrays, spaces, schedules, and
-classes of the packages that an agent is made of. What only a pickle can hold becomes one, and is read where it is trusted.
+Convert Python values to JSON and back without executing code: numbers, strings, containers, arrays, spaces, schedules, and
+classes of the packages that agents use. Any other value is pickled, and unpickled only if the file is trusted.
 """
 
 import base64
@@ -23,12 +23,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-KIND = ":kind:"  # marks what JSON has no form for
-PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_eqr")  # whose classes are found by name
-# Modules of these only define; of other packages a file gets what is imported already: some of torch's modules are programs.
+KIND = ":kind:"  # marks values that JSON cannot represent
+PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_eqr")  # whose classes are looked up by name
+# A file may import modules of these packages, which contain only definitions. Modules of other packages must already be
+# imported, because some of torch's modules are programs.
 DEFINING = ("stable_baselines3.", "sb3_contrib.")
-CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # and are derived from one of these
-# Classes whose objects are their attributes and nothing else.
+CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # base classes of the legal classes
+# Classes whose objects consist only of their attributes.
 OBJECTS = {
     "stable_baselines3.common.utils": ("FloatSchedule", "LinearSchedule", "ConstantSchedule"),
     "stable_baselines3.common.type_aliases": ("TrainFreq", "TrainFrequencyUnit"),
@@ -42,7 +43,7 @@ SPACES |= {"MultiBinary": ("n",), "Dict": ("spaces",), "Tuple": ("spaces",)}
 
 
 class UntrustedError(ValueError):
-    """A file holds pickles, whose loading runs what they name. ``names``: what that is."""
+    """A file contains pickles, and unpickling runs the functions they name. ``names``: these functions and classes."""
 
     def __init__(self, names: list[str]):
         super().__init__(", ".join(names))
@@ -50,7 +51,7 @@ class UntrustedError(ValueError):
 
 
 def encode(value: Any) -> Any:
-    """A value as JSON; what is not in this module's lists as a pickle inside it."""
+    """Convert a value to JSON; values of types that this module does not list are embedded as pickles."""
     if value is None or type(value) in (bool, int, float, str):
         return value
     for encoder in (_encode_container, _encode_array, _encode_space, _encode_known):
@@ -117,23 +118,24 @@ def _encode_known(value: Any) -> Any:
 
 def decode(value: Any, trust: bool = False) -> Any:
     """
-    The way back.
+    Convert JSON back to a value.
 
-    :param value: JSON of :func:`encode`
-    :param trust: whether pickles in it are loaded, which runs what they name
-    :raises UntrustedError: for a pickle without ``trust``
-    :raises ValueError: for what :func:`encode` does not make
+    :param value: JSON returned by :func:`encode`
+    :param trust: whether to load pickles in it, which runs the functions they name
+    :return: the value
+    :raises UntrustedError: if there is a pickle and ``trust`` is ``False``
+    :raises ValueError: if :func:`encode` cannot have written the JSON
     """
     if isinstance(value, list):
         return [decode(item, trust) for item in value]
     if not isinstance(value, Mapping):
         return value
-    if ":serialized:" in value:  # SB3's own form
+    if ":serialized:" in value:  # SB3's own format
         return _decode_pickle({"pickle": value[":serialized:"]}, trust)
     if KIND not in value:
         return {key: decode(item, trust) for key, item in value.items()}
     if value[KIND] not in DECODERS:
-        raise ValueError(f"data must be what save() writes, got {KIND} {value[KIND]!r}")
+        raise ValueError(f"data must be written by save(), got {KIND} {value[KIND]!r}.")
     return DECODERS[value[KIND]](value, trust)
 
 
@@ -145,26 +147,26 @@ def _decode_array(value: Mapping[str, Any], trust: bool) -> Any:
 def _decode_dtype(value: Mapping[str, Any], trust: bool) -> th.dtype:
     found = getattr(th, value["name"])
     if not isinstance(found, th.dtype):
-        raise ValueError(f"data must name a dtype of torch, got {value['name']!r}")
+        raise ValueError(f"data must name a dtype of torch, got {value['name']!r}.")
     return found
 
 
 def _decode_space(value: Mapping[str, Any], trust: bool) -> spaces.Space:
     if value["name"] not in SPACES:
-        raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {value['name']!r}")
+        raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {value['name']!r}.")
     return getattr(spaces, value["name"])(**decode(value["arguments"], trust))
 
 
 def _decode_class(value: Mapping[str, Any], trust: bool) -> Any:
     found = _find(value["module"], value["name"])
     if not _is_legal(found):
-        raise ValueError(f"data must name a class that agents are made of, got {value['module']}.{value['name']}")
+        raise ValueError(f"data must name a class that agents use, got {value['module']}.{value['name']}.")
     return found
 
 
 def _decode_object(value: Mapping[str, Any], trust: bool) -> Any:
     if value["name"] not in OBJECTS.get(value["module"], ()):
-        raise ValueError(f"data must be objects of {sorted(OBJECTS)}, got {value['module']}.{value['name']}")
+        raise ValueError(f"data must be objects of {sorted(OBJECTS)}, got {value['module']}.{value['name']}.")
     found: Any = _find(value["module"], value["name"])
     if value[KIND] == "enum":
         return found(decode(value["value"], trust))
@@ -205,18 +207,18 @@ DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
 
 def _find(module: str, name: str) -> Any:
     if module.split(".")[0] not in PACKAGES and module not in OBJECTS:
-        raise ValueError(f"data must name classes of {', '.join(PACKAGES)}, got {module}.{name}")
+        raise ValueError(f"data must name classes of {', '.join(PACKAGES)}, got {module}.{name}.")
     may_import = module in OBJECTS or module.startswith(DEFINING)
     found: Any = importlib.import_module(module) if may_import else sys.modules.get(module)
     if found is None:
-        raise ValueError(f"data must name a class that agents are made of, got {module}.{name}")
+        raise ValueError(f"data must name a class that agents use, got {module}.{name}.")
     for part in name.split("."):
         found = getattr(found, part)
     return found
 
 
 def _is_legal(value: Any) -> bool:
-    """A class that agents are made of, or a function of the groups' mathematics; under its name in its module."""
+    """Whether this is a class that agents use, or a function of the groups package, defined at the top level of a module."""
     if isinstance(value, type):
         legal = issubclass(value, CLASSES) and str(value.__module__).split(".")[0] in PACKAGES
     else:
@@ -225,7 +227,7 @@ def _is_legal(value: Any) -> bool:
 
 
 def names_in(content: bytes) -> list[str]:
-    """What a pickle would import, and so may run, found without loading it."""
+    """The names that a pickle would import, and so may run, determined without loading it."""
     names: list[str] = []
     strings: list[str] = []
     try:
@@ -237,5 +239,5 @@ def names_in(content: bytes) -> list[str]:
             if isinstance(argument, str):
                 strings.append(argument)
     except (ValueError, pickle.UnpicklingError):
-        names.append("(what cannot be read)")
+        names.append("(unreadable)")
     return sorted(set(names))

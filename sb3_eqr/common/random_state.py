@@ -1,4 +1,4 @@
-"""The state of all random generators that training draws from."""
+"""The state of all random generators used in training."""
 
 import random
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
-    """The state of all generators that training draws from; SB3 draws random actions from that of the action space."""
+    """The state of all generators used in training, including the action space's, from which SB3 draws random actions."""
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(),
@@ -22,7 +22,7 @@ def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
 
 
 def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
-    """The way back to a state of :func:`get_rng_state`."""
+    """Restore a state returned by :func:`get_rng_state`."""
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
@@ -33,7 +33,7 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
 
 @contextmanager
 def preserved_rng_state(*action_spaces: spaces.Space) -> Iterator[None]:
-    """All generators have the same state after the ``with`` block as before it."""
+    """Restore the state of all generators after the ``with`` block."""
     states = [get_rng_state(space) for space in action_spaces]
     try:
         yield

@@ -1,4 +1,4 @@
-"""Saving that never leaves half a file and keeps the random generators, for any off-policy algorithm."""
+"""Atomic saving for any off-policy algorithm, including the state of the random generators."""
 
 import inspect
 import io
@@ -31,26 +31,26 @@ SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 def is_whole_model(path: pathlib.Path) -> bool:
     """
     :param path: an existing file
-    :return: whether it is a zip file with everything that SB3's ``save`` puts in, unchanged. The parts of a model are zip
-        files themselves, so a truncated one may still look like a zip file.
+    :return: whether it is an unchanged zip file with everything that SB3's ``save`` writes. The components of a model are zip
+        files themselves, so a truncated file may still look like a zip file.
     """
     try:
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
             is_model = {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
             return is_model and is_unbroken(file) and archive.testzip() is None
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # of damaged headers
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # from damaged headers
         return False
 
 
 def read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
     """
-    The attributes of the model in a file (or file-like, which is left where it was), as the JSON that they are saved as; empty
-    if it is no model. Nothing in the file is executed for it.
+    Read the attributes of a saved model as JSON, without executing code in the file; empty if the file is not a model. The
+    position of a file-like object is restored.
     """
     place = path if isinstance(path, (str, pathlib.Path)) else path.tell()
     found = find_file(path) if isinstance(path, (str, pathlib.Path)) else path
     if found is None or not zipfile.is_zipfile(found):
-        return {}  # SB3 says what is wrong
+        return {}  # SB3 raises an error later
     with zipfile.ZipFile(found) as archive:  # type: ignore[arg-type]
         data = json.loads(archive.read("data"))
     if not isinstance(path, (str, pathlib.Path)):
@@ -60,10 +60,13 @@ def read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
 
 def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
     """
-    Attributes from their JSON.
+    Decode attributes from JSON.
 
-    :param path: for messages
-    :raises ValueError: if only a pickle holds one of them and ``trust`` is not given
+    :param path: path for error messages
+    :param data: the JSON of each attribute, by name
+    :param trust: whether to load pickled attributes
+    :return: the attributes by name
+    :raises ValueError: if an attribute is pickled and ``trust`` is ``False``
     """
     found, refused = {}, {}
     for name, value in data.items():
@@ -74,30 +77,30 @@ def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
     if refused:
         named = "; ".join(f"{name}: {names}" for name, names in refused.items())
         raise ValueError(
-            f"{path}: the file holds Python objects, whose loading runs code that it names ({named}). "
-            f"If you know where the file comes from, pass trust=True, or custom_objects for {', '.join(refused)}."
+            f"{path} must hold plain data, got pickled Python objects, whose loading runs the code that they name ({named}). "
+            f"If you trust the file, pass trust=True, or pass custom_objects for {', '.join(refused)}."
         )
     return found
 
 
 def refuse_folder(path: Any) -> None:
-    """Raise ValueError if a file is wanted and a folder is given."""
+    """Raise ValueError if the path is a folder instead of a file."""
     if isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).is_dir():
         if not any(pathlib.Path(f"{path}.{suffix}").is_file() for suffix in ("zip", "pkl")):
-            raise ValueError(f"{path} must be a file, got a folder. A folder of checkpoints is for resume.")
+            raise ValueError(f"{path} must be a file, got a folder. Use resume for a folder of checkpoints.")
 
 
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
-    """A model's file by its path, whose ending may be left out; raises ValueError for a folder."""
+    """Find a model's file; the path may omit the extension. Raises ValueError for a folder."""
     refuse_folder(path)
     return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
 
 
 class SafeFiles(OffPolicyAlgorithm):
-    """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with complete files only; copies."""
+    """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with atomic writes; pickling and copying."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """For ``pickle`` and ``copy``: the logger, which holds open files, becomes one without output until ``learn``."""
+        """For ``pickle`` and ``copy``: replace the logger, which holds open files, by one without output until ``learn``."""
         return {**self.__dict__, "_logger": Logger(None, []), "_custom_logger": False}
 
     def save(
@@ -107,9 +110,9 @@ class SafeFiles(OffPolicyAlgorithm):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        As SB3's ``save``, with the state of the random generators; the file is written beside and renamed. Attributes are
-        plain data (:mod:`~sb3_eqr.common.plain_data`); a class of your own in ``policy_kwargs`` is pickled, and needs
-        ``trust`` to be loaded.
+        As SB3's ``save``, with the state of the random generators; the file is written under a temporary name and renamed.
+        Attributes are saved as plain data (:mod:`~sb3_eqr.common.plain_data`), except that custom classes in
+        ``policy_kwargs`` are pickled, and need ``trust`` to be loaded.
         """
         self._before_saving()
         self.rng_state = get_rng_state(self.action_space)
@@ -126,14 +129,14 @@ class SafeFiles(OffPolicyAlgorithm):
             seal(file)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # made by _setup_model
+        return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # created by _setup_model
 
     def _make_replay_buffer(self) -> ReplayBuffer:
-        """An empty one, as the arguments say."""
+        """Create an empty replay buffer from the agent's arguments."""
         raise NotImplementedError
 
     def _before_saving(self) -> None:
-        """Called before a model is written; an exception keeps the old file."""
+        """Called before a model is written; if it raises an exception, the old file is kept."""
 
     @classmethod
     def load(
@@ -149,13 +152,13 @@ class SafeFiles(OffPolicyAlgorithm):
     ) -> SelfSafeFiles:
         """
         As SB3's ``load``, with the same parameters, and ``trust``. If the model has a seed (and no other is given), the random
-        generators are restored: a run that was saved after ``learn``, or between two rollouts, is resumed exactly (pass
+        generators are restored, so a run that was saved after ``learn``, or between two rollouts, can be resumed exactly (pass
         ``force_reset=False`` and an environment in the same state). SB3's CheckpointCallback saves in the middle of a step.
 
-        :param trust: whether Python objects in the file are loaded, which runs whatever code they name; needed for files with
-            classes of your own in ``policy_kwargs``, and for those of SB3's own ``save``
+        :param trust: whether to load pickled Python objects in the file, which runs any code they name; needed for files with
+            custom classes in ``policy_kwargs``, and for files written by SB3's own ``save``
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
-        :raises TypeError: for a keyword that is no argument of the agent
+        :raises TypeError: if a keyword is not an argument of the agent
         """
         check_names(
             f"{cls.__name__}.load",
@@ -166,8 +169,8 @@ class SafeFiles(OffPolicyAlgorithm):
             found = find_file(path)
             if found is not None and not is_whole_model(found):
                 raise ValueError(
-                    f"{found}: expected a whole file of {cls.__name__}.save, found one that is truncated, damaged or "
-                    "something else. Load an earlier checkpoint."
+                    f"{found} must be a complete file written by {cls.__name__}.save, got a truncated or damaged file, or "
+                    "another kind of file. Load an earlier checkpoint."
                 )
         given = custom_objects or {}
         data = {name: value for name, value in read_data(path).items() if name not in given}
@@ -175,10 +178,10 @@ class SafeFiles(OffPolicyAlgorithm):
         module = str(saved.get("module", saved.get("__module__", ""))) if isinstance(saved, dict) else ""
         if module.startswith(("stable_baselines3.", "sb3_contrib.")):
             raise ValueError(
-                f"{path}: expected a file of {cls.__name__}.save, found an agent whose policy is of {module}. "
-                "Load it by the class that saved it."
+                f"{path} must be a file written by {cls.__name__}.save, got an agent with a policy of {module}. "
+                "Load it with the class that saved it."
             )
-        objects = {**decode_data(path, data, trust), **given}  # in place of SB3's unpickling
+        objects = {**decode_data(path, data, trust), **given}  # instead of SB3's unpickling
         model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
         if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
@@ -194,17 +197,18 @@ class SafeFiles(OffPolicyAlgorithm):
         trust: bool = False,
     ) -> SelfSafeFiles:
         """
-        Continue where a checkpoint of :class:`~sb3_eqr.common.checkpoints.ExactCheckpointCallback` was written, bit for bit as
-        if the run had not stopped: ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
+        Resume from a checkpoint of :class:`~sb3_eqr.common.checkpoints.ExactCheckpointCallback`, bit for bit as if the run had
+        not stopped. Then call ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
 
-        :param path: the checkpoint, or the folder of checkpoints, whose last one is taken
-        :param env: built as for the run, VecNormalize included
+        :param path: the checkpoint, or a folder of checkpoints, whose last one is used
+        :param env: environment built as in the original run, including VecNormalize
         :param device: as in ``load``
-        :param trust: likewise
-        :raises ValueError: if there is no complete checkpoint, or a file in it has changed
+        :param trust: as in ``load``
+        :return: the agent
+        :raises ValueError: if there is no complete checkpoint, or one of its files has changed
         """
         if env is None:
-            raise ValueError("env must be an environment, built as for the run that is resumed, got None.")
+            raise ValueError("env must be an environment, built as in the original run, got None.")
         checkpoint, manifest = read_manifest(pathlib.Path(path))
         is_exact = not manifest["hidden"]
         if not is_exact:
@@ -218,13 +222,13 @@ class SafeFiles(OffPolicyAlgorithm):
         return model
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """As SB3's ``save_replay_buffer``, as arrays and plain data; the file is written beside and renamed."""
+        """As SB3's ``save_replay_buffer``, but writes arrays and plain data, under a temporary name that is then renamed."""
         assert self.replay_buffer is not None
         notes = {"algorithm": type(self).__name__, "num_timesteps": self.num_timesteps}
         if not isinstance(path, (str, pathlib.Path)):
             write_buffer(path, self.replay_buffer, notes)  # type: ignore[arg-type]
             return
-        with atomic_write(path, "pkl") as file:  # SB3's ending, which scripts expect
+        with atomic_write(path, "pkl") as file:  # SB3's extension, which scripts expect
             write_buffer(file, self.replay_buffer, notes)
             seal(file)
 
@@ -234,9 +238,9 @@ class SafeFiles(OffPolicyAlgorithm):
         """
         As SB3's ``load_replay_buffer``; ``truncate_last_traj`` has no effect here.
 
-        :param trust: whether a pickle, as SB3 writes it, is loaded, which runs whatever code it names
-        :raises ValueError: if the file is truncated or changed, needs ``trust``, or holds a buffer of another kind or
-            algorithm, or for other spaces or environments; the model then keeps the buffer it had
+        :param trust: whether to load a pickle, as written by SB3, which runs any code it names
+        :raises ValueError: if the file is truncated or modified, needs ``trust``, or holds a buffer of another class, of
+            another algorithm, or for other spaces or environments; the model then keeps its current buffer
         """
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
@@ -246,10 +250,10 @@ class SafeFiles(OffPolicyAlgorithm):
         found = {"algorithm": type(self).__name__, **notes, **_describe(loaded)}
         steps = found.pop("num_timesteps", self.num_timesteps)
         if expected != found:
-            raise ValueError(f"{path}: expected a replay buffer of {expected}, found {found}. Load the one of this model.")
+            raise ValueError(f"{path} must be a replay buffer of {expected}, got {found}. Load the one saved with this model.")
         if steps != self.num_timesteps:
             warnings.warn(
-                f"{path}: this replay buffer was saved at step {steps}, and the model is of step {self.num_timesteps}. "
+                f"{path}: this replay buffer was saved at step {steps}, but the model is at step {self.num_timesteps}. "
                 "Load files that were saved together."
             )
         loaded.device = self.device
@@ -269,15 +273,15 @@ class SafeFiles(OffPolicyAlgorithm):
             if not trust:
                 named = ", ".join(names_in(file.read()))
                 raise ValueError(
-                    "it is truncated, or a pickle, whose loading runs the code that it names"
-                    f"{f' ({named})' if named else ''}: pass trust=True for one of yours"
+                    "it is truncated, or a pickle, and loading a pickle runs the code that it names"
+                    f"{f' ({named})' if named else ''}: pass trust=True if you trust the file"
                 )
             super().load_replay_buffer(file)  # type: ignore[arg-type]
             return self.replay_buffer, {}
         except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:
             raise ValueError(
-                f"{path}: expected a complete replay buffer saved by {type(self).__name__}.save_replay_buffer, "
-                f"found something else ({error}). Load an earlier one."
+                f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
+                f"got something else ({error}). Load an earlier one."
             ) from error
         finally:
             self.replay_buffer = before
@@ -286,5 +290,5 @@ class SafeFiles(OffPolicyAlgorithm):
 
 
 def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:
-    names = ("observation_space", "action_space", "n_envs", "alpha")  # α is in every stored priority
+    names = ("observation_space", "action_space", "n_envs", "alpha")  # stored priorities depend on α
     return {"class": type(buffer).__name__, **{name: getattr(buffer, name) for name in names if hasattr(buffer, name)}}

@@ -1,4 +1,4 @@
-"""The representation of one agent for another: tasks that differ in reward share their transitions' symmetries (paper, §4)."""
+"""Transfer of representations: tasks that differ only in rewards share the symmetries of their transitions (paper, §4)."""
 
 import io
 import pathlib
@@ -19,11 +19,11 @@ LATENT_PARTS = ("embedding", "transition", "action_symmetry", "projection")  # �
 
 def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.BufferedIOBase) -> None:
     """
-    Put encoder, κ, ρ and b of a saved agent into a policy and its target copy. If something does not fit, nothing is changed.
+    Load encoder, κ, ρ and b of a saved agent into a policy and its target copy. On any mismatch, nothing is changed.
 
-    :param policy: of either agent
-    :param path: a file of either agent
-    :raises ValueError: if the file holds no EqR agent, or one of another group, trunk or number of actions
+    :param policy: policy of either agent
+    :param path: file of either agent
+    :raises ValueError: if the file is not an EqR agent, or its group, trunk or number of actions differs
     """
     found = _saved_parts(path, policy.device)
     check_same_parameters({"group": policy.description["group"]}, read_data(path).get("policy_description", {}))
@@ -34,10 +34,10 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
         for key in sorted(expected.keys() | given.keys()):
             if expected.get(key) != given.get(key):
                 raise ValueError(
-                    f"load_representation: expected the encoder, group and actions of this agent; {name}.{key} is "
-                    f"{expected.get(key, 'missing')} here and {given.get(key, 'missing')} in the file. Build this agent with "
-                    "the policy_kwargs of that one (head_input, group, n_blocks, parameterization, whiten, layer_norm, trunk, "
-                    "latent_hidden_dim, state_dependent_actions), for the same observations and actions."
+                    f"load_representation: {name}.{key} must be the same in both agents, got {expected.get(key, 'missing')} "
+                    f"here and {given.get(key, 'missing')} in the file. Build this agent with the policy_kwargs of the saved "
+                    "agent (head_input, group, n_blocks, parameterization, whiten, layer_norm, trunk, latent_hidden_dim, "
+                    "state_dependent_actions), for the same observations and actions."
                 )
     for name, module in modules.items():
         module.load_state_dict(found[name])
@@ -51,22 +51,22 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
 
 
 def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
-    """The encoder and the parts of the latent model that do not depend on rewards, by name."""
+    """The encoder and the components of the latent model that do not depend on rewards, by name."""
     return {ENCODER: policy.online.features_extractor} | {name: getattr(policy.latent_model, name) for name in LATENT_PARTS}
 
 
 def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device) -> dict[str, dict[str, th.Tensor]]:
-    """The parameters of each part of the representation in a file."""
+    """The parameters of each component of the representation in a file."""
     if isinstance(path, (str, pathlib.Path)):
         found_file = find_file(path)
         if found_file is not None and not is_whole_model(found_file):
             raise ValueError(
-                f"load_representation: expected a whole file of an agent's save, found one that is truncated: {path}."
+                f"load_representation: {path} must be a complete file written by an agent's save, got a truncated one."
             )
     _, saved, _ = load_from_zip_file(path, load_data=False, device=device)  # type: ignore[arg-type]
     parameters: Any = (saved or {}).get("policy", {})
     if not any(name.startswith("latent_model.") for name in parameters):
-        raise ValueError(f"load_representation: expected a file of EqRQRDQN or EqRRainbow, found another in {path}.")
+        raise ValueError(f"load_representation: {path} must be a file of EqRQRDQN or EqRRainbow, got another one.")
     found: dict[str, dict[str, th.Tensor]] = {name: {} for name in (ENCODER, *LATENT_PARTS)}
     for name, value in parameters.items():
         match = re.fullmatch(rf"(?:(?!\w+_target\.)\w+\.{ENCODER}|latent_model\.(\w+))\.(.+)", name)

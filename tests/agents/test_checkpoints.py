@@ -138,9 +138,9 @@ def test_a_run_without_a_seed_cannot_restart_in_its_folder(tmp_path):
 
 
 def test_the_environment_must_be_built_in_the_same_way(checkpoint):
-    with pytest.raises(ValueError, match=r"must be a DummyVecEnv, got VecNormalize: .*VecNormalize included"):
+    with pytest.raises(ValueError, match=r"must be a DummyVecEnv, got VecNormalize: .*including VecNormalize"):
         EqRQRDQN.resume(checkpoint, VecNormalize(make_vec_env(ChainEnv)))
-    with pytest.raises(ValueError, match="env must be an environment, built as for the run"):
+    with pytest.raises(ValueError, match="env must be an environment, built as in the original run"):
         EqRQRDQN.resume(checkpoint, None)
 
 
