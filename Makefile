@@ -8,7 +8,7 @@ ARGS ?=
 STEPS ?=
 DEMO = OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" SDL_VIDEODRIVER=dummy $(BIN)/python examples/demo.py
 
-.PHONY: demo quick test pytest slow format lint type commit-checks doc dist clean
+.PHONY: demo tutorials quick test pytest slow format lint type commit-checks doc dist clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -48,6 +48,10 @@ commit-checks: format lint type
 
 doc: $(VENV)/installed
 	$(BIN)/python -m sphinx -b html -W --keep-going docs docs/_build/html
+
+# The notebooks, with new outputs: some minutes.
+tutorials: $(VENV)/installed
+	$(BIN)/jupyter execute --inplace docs/tutorials/*.ipynb
 
 # For a release: build a wheel and a source archive, and check that the wheel works in an empty environment.
 dist: $(VENV)/installed

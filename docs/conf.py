@@ -14,19 +14,23 @@ copyright = "the sb3_eqr developers, MIT licence"
 release = version = sb3_eqr.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # Markdown pages, and the notebooks with the outputs that they were saved with
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # formulas without a network
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["style.css"]
 html_title = f"sb3_eqr {release}"
 
 # Pages are read on GitHub as well: $...$ are formulas in both, `#heading` works in links in both.
 myst_enable_extensions = ["amsmath", "dollarmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "off"  # make tutorials executes them
 
 # Docstrings are reST with `:param x:`; types come from the signatures.
 autodoc_typehints = "description"

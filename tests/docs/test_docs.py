@@ -21,6 +21,7 @@ import warnings
 
 import huggingface_hub
 import huggingface_sb3
+import matplotlib
 import pytest
 import stable_baselines3.common.evaluation
 import yaml
@@ -43,6 +44,10 @@ ROOT = pathlib.Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(set(DOCS.rglob("*.md")) - set((DOCS / "_build").rglob("*")))]
 STEPS, LEARNING_STARTS, TRAIN_FREQ, GRADIENT_STEPS, ROLLOUT, GAME_STEPS = 20, 16, 4, 2, 8, 40
+
+
+SHELL = ("git", "cd", ".")
+CPU_BUILD = ("torch", "--index-url", "https://download.pytorch.org/whl/cpu")  # of install.md
 
 
 def name_of(page):
@@ -89,7 +94,7 @@ def check_pages(example):
     folder = pathlib.Path(example.path).parent
     for line in example.parsed.splitlines():
         path = re.sub(r".* <(.*)>$", r"\1", line)  # Title <path>
-        assert not path or path.startswith(":") or (folder / f"{path}.md").is_file(), line
+        assert not path or path.startswith(":") or any((folder / f"{path}.{kind}").is_file() for kind in ("md", "ipynb")), line
 
 
 def check_include(example):
@@ -161,13 +166,17 @@ def check_command(words):
         check_sb3_eqr(words[3:])
     elif program == "sb3-eqr":
         check_sb3_eqr(arguments)
+    elif words[:2] == ["python", "-c"]:
+        exec(words[2], {})
+    elif words[:3] == ["python", "-m", "venv"]:
+        assert len(words) == 4, words
     elif words[:2] == ["python", "-m"]:
         check_script(lambda: runpy.run_module(words[2], run_name="__main__"), words[3:])
     elif program == "python":
         assert pathlib.Path(words[1]).parent.name == "examples", words
         check_script(lambda: runpy.run_path(str(ROOT / words[1]), run_name="__main__"), words[2:])
     else:
-        raise AssertionError(f"there is no check for the command {program}")
+        assert program in SHELL, f"there is no check for the command {program}"
 
 
 def check_pip(arguments):
@@ -180,7 +189,7 @@ def check_pip(arguments):
         elif word.endswith(".txt"):
             assert (ROOT / word).is_file(), word
         else:
-            assert word in (".", "-c", "-e"), word
+            assert word in (".", "-c", "-e", *CPU_BUILD), word
 
 
 def check_make(arguments):
@@ -227,6 +236,9 @@ def check_script(call, arguments):
                 call()
         except Understood as understood:
             return understood.args[0]
+        except SystemExit as stopped:
+            assert stopped.code == 0 and "--help" in arguments
+            return None
         assert not arguments  # a script without arguments has run completely
         return None
 
@@ -315,6 +327,19 @@ def test_relative_links_exist(page):
         if anchor:
             headings = re.findall(r"^#+ (.*)$", found.read_text(encoding="utf-8"), re.M)
             assert anchor in [re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings], target
+
+
+@pytest.mark.parametrize("notebook", sorted((DOCS / "tutorials").glob("*.ipynb")), ids=name_of)
+def test_notebooks_run_and_have_outputs(notebook, shortened):
+    """Every code cell runs, shortened; the saved outputs, which the pages show, are of a complete run without an error."""
+    pytest.importorskip("IPython")
+    cells = [cell for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+    matplotlib.use("Agg")
+    namespace = {}
+    for cell in cells:
+        exec("".join(cell["source"]), namespace)
+        assert cell["execution_count"] and all(output["output_type"] != "error" for output in cell["outputs"])
+    assert any("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"])
 
 
 STORY = [  # lines of the pages in a working order, and arguments that shorten them by overriding earlier ones

@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import sb3_eqr
+from benchmarks import installation
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.envs import make_atari100k_env
@@ -87,3 +88,13 @@ def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen)
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     lines = found.stdout.splitlines()
     assert lines[0] == "False" and lines[-1] == (chosen or "PASSIVE") and "usage" in found.stdout
+
+
+def test_the_commands_of_the_installation_script_are_those_of_the_pages():
+    pages = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in installation.PAGES)
+    lines = [re.sub(r"\s+", " ", line.strip()) for line in pages.replace("\\\n", " ").splitlines()]
+    assert all(command.line in lines for command in installation.COMMANDS)
+    assert all(long in pages for long in installation.SHORTER)
+    assert all(
+        "EqR" in text and "_000" not in re.sub(r"2_000|seed=1_000", "", text) for text in installation.scripts(ROOT).values()
+    )
