@@ -150,7 +150,7 @@ def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
             rows.append({"name": event.key, "calls": event.count / N_COUNTED, **times})
         shown = [row for row in rows if row["name"].startswith("stage")]
         shown += [row for row in rows if row not in shown][:N_OPERATIONS]
-        notes = [f"all: {sum(row['self_ms'] for row in rows):.2f} ms; self: without what is called inside"]
+        notes = [f"all: {sum(row['self_ms'] for row in rows):.2f} ms; self: excluding nested calls"]
         yield Table(f"profile_{name}_{key}", f"Update of {name} by stage and operation, {key}", shown, notes)
 
 

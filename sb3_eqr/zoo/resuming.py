@@ -47,9 +47,7 @@ class ResumableExperiment(ExperimentManager):
             return super()._load_pretrained_agent(hyperparams, env)
         model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
         if self.n_timesteps <= model.num_timesteps:
-            fail(
-                f"--resume: {self.resume} is already at step {model.num_timesteps}, and -n is {self.n_timesteps}. Pass a larger -n."
-            )
+            fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {self.n_timesteps}.")
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         return model
