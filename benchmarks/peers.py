@@ -93,7 +93,7 @@ def main() -> None:
     unexplained = []
     for test in failed:
         module, _, name = test.partition(": ")
-        reason = REASONS.get(module) or REASONS.get(name.partition("[")[0])
+        reason = REASONS.get(name.partition("[")[0]) or REASONS.get(module)
         unexplained += [] if reason else [test]
         lines.append(f"- `{test}`: {reason or '**no reason is known**'}.")
     text = "\n".join([*lines, ""])
