@@ -34,6 +34,8 @@ MODULES = {
 COMMANDS = [*FUNCTIONS, *MODULES]
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
 LOADING = ("enjoy", "record_video", "push_to_hub")
+# Errors of RL Zoo that may have a cause which the user can remove.
+MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, FileNotFoundError)
 DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 
 # Packages of the extra "zoo".
@@ -213,25 +215,29 @@ def run(command: str, arguments: list[str]) -> None:
         else:
             module, function = FUNCTIONS[command].split(":")
             getattr(importlib.import_module(module), function)()
-    except ModuleNotFoundError as error:
+    except (*MISTAKES, gym.error.DependencyNotInstalled) as error:
+        message = explanation(command, error)
+        if message is None:
+            raise
+        fail(message)
+
+
+def explanation(command: str, error: Exception) -> str | None:
+    """:return: what the user can do about an error of RL Zoo; ``None`` for an error with another cause"""
+    if isinstance(error, ModuleNotFoundError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
-        fail(f"{command}: {error}.{advice}")
-    except gym.error.DependencyNotInstalled as error:
-        fail(str(error))
-    except NotImplementedError as error:
-        if "observation space is not supported" not in str(error):
-            raise
-        fail(f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these.")
-    except AssertionError as error:
-        if "as action spaces but" not in str(error):
-            raise
-        fail(f"{command}: {error}. These agents need discrete actions.")
-    except (ValueError, TypeError, FileNotFoundError) as error:
-        if command in PLOTS:
-            fail(f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each.")
-        if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):
-            fail(f"{error} Run TRUST_REMOTE_CODE=True sb3-eqr load_from_hub ...")
-        raise
+        return f"{command}: {error}.{advice}"
+    if isinstance(error, gym.error.DependencyNotInstalled):
+        return str(error)
+    if "observation space is not supported" in str(error):
+        return f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these."
+    if "as action spaces but" in str(error):
+        return f"{command}: {error}. These agents need discrete actions."
+    if command in PLOTS and not isinstance(error, (AssertionError, NotImplementedError)):
+        return f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each."
+    if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):
+        return f"{error} Run TRUST_REMOTE_CODE=True sb3-eqr load_from_hub ..."
+    return None
 
 
 def prepare(command: str, arguments: list[str]) -> list[str]:
