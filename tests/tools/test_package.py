@@ -71,9 +71,9 @@ def test_readme_example_runs(tmp_path, monkeypatch):
     """The first block of the README, with fewer steps."""
     monkeypatch.chdir(tmp_path)
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[1]
-    assert "model.learn(100_000, progress_bar=True)" in code
-    exec(code.replace("100_000", "30"), {})
-    assert (tmp_path / "pong.zip").exists()
+    assert "model.learn(20_000, progress_bar=True)" in code
+    exec(code.replace("20_000", "30"), {})
+    assert (tmp_path / "cartpole.zip").exists()
 
 
 @pytest.mark.parametrize("chosen", [None, "ACTIVE"])
