@@ -7,12 +7,14 @@ import importlib.metadata
 import os
 import pathlib
 import platform
+import re
 import shutil
 import tempfile
 import time
 import traceback
 from typing import Any
 
+import numpy as np
 import torch as th
 import yaml
 from filelock import FileLock, Timeout
@@ -32,6 +34,7 @@ from sb3_eqr.common.plain_data import decode
 from sb3_eqr.common.resets import Resets
 from sb3_eqr.zoo import register
 
+LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
 PROGRESS_SECONDS = 2.0  # between writes of a run's progress
 PACKAGES = (
     "sb3-eqr",
@@ -62,17 +65,18 @@ def new_record() -> dict[str, Any]:
 
 class LossWriter(KVWriter):
     """
-    Collects the losses that SB3 logs.
+    Collects the losses and the gradients at the state that SB3 logs, and what LatentCallback does.
 
-    :param losses: a row is appended at each dump of the log
+    :param losses: a row is appended at each dump of the log; keys without "train/"
     """
 
     def __init__(self, losses: list[dict[str, float]]):
         self._losses = losses
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Append the logged losses; the interface of SB3's writers."""
-        row = {key[6:]: float(v) for key, v in key_values.items() if key.startswith("train/") and key.endswith("loss")}
+        """Append what was logged; the interface of SB3's writers."""
+        kept = {key: value for key, value in key_values.items() if re.fullmatch(LOGGED, key) and np.isscalar(value)}
+        row = {key.removeprefix("train/"): float(value) for key, value in kept.items()}
         if row:
             self._losses.append({"step": step, **row})
 

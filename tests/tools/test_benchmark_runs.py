@@ -113,7 +113,7 @@ def test_the_contents_of_the_result(tmp_path):
     assert result["versions"]["torch"] and result["machine"]["device"] == "cpu" and result["machine"]["threads"] == 1
     assert result["wall_clock_s"] >= result["training_seconds"] > 0
     assert result["steps_per_second"] == pytest.approx(STEPS / result["training_seconds"], abs=0.01)
-    assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "step"} <= result["losses"][-1].keys()
+    assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "td_state_gradient", "step"} <= result["losses"][-1].keys()
 
 
 def test_evaluations_do_not_change_training(tmp_path):
