@@ -23,9 +23,8 @@ BUFFER = "it looks at the arrays of SB3's own replay buffer; ours stores each fr
 COUNTER = "it fills all tensors with random numbers, but batch norm's counters in the latent networks are integers"
 TRUNK = "it looks for a layer of a custom features extractor, which is at features_extractor.trunk here"
 HER = "hindsight replay uses its own buffer, without the sequences that the losses need"
-REASONS = {  # a module of tests, or a test without its parameters
-    "test_her": HER,
-    "test_n_step_replay": "it expects SB3's own buffer for n-step returns",
+MODULES = {"test_her": HER, "test_n_step_replay": "it expects SB3's own buffer for n-step returns"}
+REASONS = {  # tests, without their parameters
     "test_feature_extractor_target_net": COPIED,
     "test_features_extractor_target_net": COPIED,
     "test_image_like_input": "it expects an AssertionError for float images; ours is a ValueError that says what to pass",
@@ -93,7 +92,7 @@ def main() -> None:
     unexplained = []
     for test in failed:
         module, _, name = test.partition(": ")
-        reason = REASONS.get(name.partition("[")[0]) or REASONS.get(module)
+        reason = MODULES.get(module) or REASONS.get(name.partition("[")[0])
         unexplained += [] if reason else [test]
         lines.append(f"- `{test}`: {reason or '**no reason is known**'}.")
     text = "\n".join([*lines, ""])

@@ -179,6 +179,8 @@ def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, 
     # With exploration noise: without it, an agent after little training repeats one action.
     record(model, env, out / "latents", ANIMATION_STEPS, seed=args.seed + 20_000, deterministic=False)
     print(diagnose(model, play(model, env, DIAGNOSIS_STEPS, seed=args.seed + 30_000)).summary)
+    if is_atari(args.game) and model.num_timesteps < FULL_STEPS / 10:
+        print(f"{model.num_timesteps} steps are far too few to learn a game of Atari: the benchmark has {FULL_STEPS:,}.")
 
 
 def main() -> None:

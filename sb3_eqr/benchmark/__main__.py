@@ -23,6 +23,7 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, or one from --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
     run.add_argument("--agents", nargs="+", help="ALGO or ALGO:ENTRIES, such as qrdqn, qrdqn:stock, eqr_rainbow:se2+aet")
+    run.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")
     run.add_argument("--games", nargs="+", help="a subset of the suite's games (default: all)")
     run.add_argument("--seeds", type=int, help=f"number of seeds, counted from 0 (default: {SEEDS})")
     run.add_argument("--steps", type=int, help="training steps instead of the suite's")

@@ -95,20 +95,27 @@ def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
     difference, detectable = row["difference"], row["detectable"]
     if difference == 0:
         return f"{agent} and {other} have the same IQM."
-    size, side = _small(abs(difference)), "above" if difference > 0 else "below"
+    size, least = _distinct(abs(difference), detectable)
+    side = "higher" if difference > 0 else "lower"
     if math.isnan(detectable):
-        return f"The IQM of {agent} is {size} {side} that of {other}: a single run does not show how much of that is chance."
+        chance = "a single run does not show how much of that is chance"
+        return f"The IQM of {agent} is {size} {side} than that of {other}: {chance}."
     runs = str(row["runs"]) if row["runs"] == row["baseline_runs"] else f"{row['runs']} and {row['baseline_runs']}"
-    shown = f"{runs} runs on {counted(row['games'], 'game')} can only detect differences above {_small(detectable)}"
+    shown = f"{runs} runs on {counted(row['games'], 'game')} can only detect differences above {least}"
     if abs(difference) < detectable:
-        return f"{agent} and {other} cannot be distinguished with these runs: their IQMs differ by {size}, and {shown}."
+        found = f"the IQM of the first is {size} {side}"
+        return f"{agent} and {other} cannot be distinguished with these runs: {found}, and {shown}."
     verdict = "better" if difference > 0 else "worse"
-    return f"{agent} is {verdict} than {other}: its IQM is {size} {side}, and {shown.replace('only ', '')}."
+    return f"{agent} is {verdict} than {other}: its IQM is {size} {side}; {shown.replace('only ', '')}."
 
 
-def _small(value: float) -> str:
-    """:return: two decimals, or as many as a smaller number needs for one significant digit"""
-    return number(value, 2 if value >= 0.01 or value == 0 else min(6, 1 - math.floor(math.log10(value))))
+def _distinct(difference: float, detectable: float) -> tuple[str, str]:
+    """:return: both with two decimals, or with as many more as show a digit of each and which of them is larger"""
+    for decimals in range(2, 7):
+        texts = number(difference, decimals), number(detectable, decimals)
+        if texts[0] != texts[1] and float(texts[0].replace(",", "")) != 0:
+            break
+    return texts
 
 
 def counted(count: int, noun: str) -> str:
@@ -140,7 +147,7 @@ def table_notes(analysis: Analysis) -> list[str]:
     """
     comparison = analysis.comparison
     found = [
-        "Raw scores: mean ± standard deviation over runs. Bold: better than every other agent by more than chance explains.",
+        "Raw scores: mean ± standard deviation over runs. Bold: significantly better than every other agent.",
         "Below: aggregates of normalised scores over all runs and games, with 95% intervals; "
         f"{comparison.above_one} are games with a mean above 1.",
     ]

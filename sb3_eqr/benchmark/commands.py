@@ -12,6 +12,7 @@ from sb3_eqr.benchmark.dispatch import make_table, run_benchmark
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, write_plan
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.envs import import_packages
 from sb3_eqr.zoo.checks import check_machine, fail
 
 
@@ -62,13 +63,20 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
 
 def run(args: argparse.Namespace) -> int:
     """:return: exit status: 1 if a run failed"""
+    import_packages(args.gym_packages)
     device = check_resources(args)
     runs = make_plan(args)
     for note in never_learn([planned.description() for planned in runs]):
         print(f"Note: {note}")
     command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
     threads = max(int(args.cpus_per_run), 1)
-    settings = Settings(command=command, device=device, n_threads=threads, checkpoint_seconds=args.checkpoint_every)
+    settings = Settings(
+        command=command,
+        device=device,
+        n_threads=threads,
+        checkpoint_seconds=args.checkpoint_every,
+        gym_packages=args.gym_packages,
+    )
     failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, Console())
     for lost in failed:
         print(f"failed: {lost.label}: {lost.folder / ERROR}")

@@ -128,7 +128,7 @@ def compare(
         notes=notes,
     )
     if comparison.human and not comparison.has_published:
-        notes.append("Published scores are for 100,000 training steps, these runs are not: published scores are left out.")
+        notes.append("Published scores are omitted, because they are for 100,000 steps.")
     return dataclasses.replace(comparison, scores=_scores(comparison, references, suites))
 
 

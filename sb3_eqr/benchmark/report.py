@@ -62,7 +62,7 @@ def write_report(
     table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
     files = {f"{figure.name}.png": to_png(figure) for figure in figures}
     files |= _data_files(comparison.episodes, aggregates_file(analysis)) | _table_files(analysis, table)
-    before = notes(analysis)
+    before, shown = notes(analysis), conclusion(analysis)
     if "scores.parquet" not in files:
         before.append("scores.parquet was left out: it needs pyarrow (pip install pyarrow).")
     environment = jinja2.Environment(
@@ -72,7 +72,7 @@ def write_report(
         title=f"Benchmark {comparison.suite}",
         style=Markup(TEMPLATE.with_name("report.css").read_text(encoding="utf-8")),
         lead=_lead(comparison),
-        conclusion=conclusion(analysis),
+        conclusion=shown,
         notes=before,
         summary=_html(summary_table(comparison, analysis.aggregates, analysis.matrices, reps)),
         figures=[(figure, files[f"{figure.name}.png"]) for figure in figures],
@@ -84,6 +84,8 @@ def write_report(
         versions=all_of(f"{name} {importlib.metadata.version(name)}" for name in ("rliable", "numpy", "scipy", "pandas")),
     )
     files["report.html"] = page.encode()  # last: where it exists, so do the others
+    for sentence in shown:
+        print(sentence)
     for note in before:
         print(f"Note: {note}")
     for name, content in files.items():

@@ -27,12 +27,14 @@ class Settings(Strict):
     :param device: PyTorch device
     :param n_threads: number of PyTorch threads
     :param checkpoint_seconds: seconds between checkpoints
+    :param gym_packages: packages that register environments
     """
 
     command: str = ""
     device: str = "auto"
     n_threads: int = 1
     checkpoint_seconds: float = 300.0
+    gym_packages: list[str] = []
 
 
 class State(NamedTuple):

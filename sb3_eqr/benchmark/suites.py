@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, Val
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.files import atomic_write
-from sb3_eqr.zoo.checks import nearest
+from sb3_eqr.zoo.checks import SIMILAR, nearest
 
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
 
@@ -208,7 +208,8 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
-                f'{nearest(env_id, gym.registry)} For Atari: pip install ".[atari]" in a clone of the repository.'
+                f"{nearest(env_id, gym.registry, SIMILAR)} Environments of another package need --gym-packages PACKAGE, Atari "
+                'pip install ".[atari]" in a clone of the repository.'
             )
     return suite.model_copy(update={"games": kept, "steps": per_game})
 

@@ -75,7 +75,11 @@ class LossWriter(KVWriter):
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Append what was logged; the interface of SB3's writers."""
-        kept = {key: value for key, value in key_values.items() if re.fullmatch(LOGGED, key) and np.isscalar(value)}
+        kept = {
+            key: value
+            for key, value in key_values.items()
+            if re.fullmatch(LOGGED, key) and isinstance(value, (int, float, np.number))
+        }
         row = {key.removeprefix("train/"): float(value) for key, value in kept.items()}
         if row:
             self._losses.append({"step": step, **row})
@@ -275,6 +279,7 @@ def train(run: Run, settings: Settings) -> None:
     """Train, evaluate, write ``result.json``; an interrupted run resumes from its last checkpoint."""
     started = time.monotonic()
     envs.register()
+    envs.import_packages(settings.gym_packages)
     register()
     with open(run.folder / STARTS, "a", encoding="utf-8") as file:
         file.write(datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds") + "\n")

@@ -3,6 +3,8 @@ Environments. Importing this package needs no extra; creating an Atari environme
 of the repository.
 """
 
+import importlib
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -39,6 +41,22 @@ def register() -> None:
         if env_id not in gym.registry:
             gym.register(env_id, **arguments)
     register_minatar()
+
+
+def import_packages(packages: Iterable[str]) -> None:
+    """
+    Import packages that register environments with gymnasium.
+
+    :raises ValueError: if a package cannot be imported
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ValueError(
+                f"--gym-packages: {package!r} cannot be imported ({error}). Install it, correct the name, or add its folder "
+                "to PYTHONPATH."
+            ) from error
 
 
 __all__ = ["BlindCliffwalk", "PixelPendulum", "SlidingBall", "StarField", "make_atari100k_env", "register"]

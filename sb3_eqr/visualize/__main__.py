@@ -1,6 +1,7 @@
 """The command line: ``sb3-eqr visualize MODEL.zip``."""
 
 import argparse
+import os
 import pathlib
 import sys
 from typing import NoReturn
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import Play, encode, play
 from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
@@ -29,6 +31,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
     parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file written by an agent's save")
     parser.add_argument("--env", help="gymnasium id (default: from RL Zoo's files next to MODEL)")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="arguments of the environment")
     parser.add_argument("--algo", choices=list(AGENTS), help="default: detected from MODEL")
     parser.add_argument("--steps", type=int, default=1000, help="steps to run, over all environments (default: 1000)")
@@ -50,6 +53,8 @@ def run(args: argparse.Namespace) -> None:
     """
     if args.n_envs < 1:
         raise ValueError(f"--n-envs must be >= 1, got {args.n_envs}.")
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # environments draw in memory: pygame needs no display
+    import_packages(args.gym_packages)
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
     env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust)

@@ -54,10 +54,12 @@ class Diagnostics(NamedTuple):
     @property
     def summary(self) -> str:
         """The verdict in one sentence, and what to do in a second one."""
-        skill, gain = skill_and_gain(self.loss)
+        skill, gain = map(_share, skill_and_gain(self.loss))
+        latent_skill, latent_gain = map(_share, skill_and_gain(self.transition))
         removed = (
-            f"over {len(self.loss.error)} steps it removes {_share(skill)} of the error of shuffled targets and "
-            f"{_share(gain)} of that of standing still"
+            f"over {len(self.loss.error)} steps it removes {skill} of the error of shuffled targets and {gain} of that of "
+            f"standing still, between the projections that the AET loss compares ({latent_skill} and {latent_gain} between "
+            "latent states)"
         )
         return SENTENCES[self.verdict].format(removed=removed)
 

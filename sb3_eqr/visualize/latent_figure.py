@@ -125,7 +125,7 @@ def _outside(ax: Axes, points: ArrayLike) -> str:
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     x, y = np.asarray(points).T
     count = int(((x < left) | (x > right) | (y < bottom) | (y > top)).sum())
-    return f" ({count} out)" if count else ""
+    return f" ({count} outside)" if count else ""
 
 
 def _principal(x: th.Tensor) -> np.ndarray:

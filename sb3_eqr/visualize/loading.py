@@ -167,8 +167,11 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
 
 def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
     if env_id not in gym.registry:
-        near = difflib.get_close_matches(env_id, list(gym.registry), n=1)
-        raise ValueError(f"--env: {env_id!r} is not registered with gymnasium.{f' Did you mean {near[0]!r}?' if near else ''}")
+        near = difflib.get_close_matches(env_id, list(gym.registry), n=1, cutoff=0.8)
+        raise ValueError(
+            f"--env: {env_id!r} is not registered with gymnasium.{f' Did you mean {near[0]!r}?' if near else ''} "
+            "Environments of another package need --gym-packages PACKAGE."
+        )
     try:
         return make_vec_env(env_id, n_envs, seed, env_kwargs=kwargs)  # sets render_mode where supported
     except TypeError as error:

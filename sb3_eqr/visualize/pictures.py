@@ -98,7 +98,7 @@ def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
     axes[0].set_yticks(range(len(actions)), actions, fontsize=8 if len(actions) < 12 else 6)
     axes[0].set_ylabel("action")
     bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
-    bar.set_label("mean distance that an action moves a block")
+    bar.set_label("mean distance that an action moves a block (grey: the action was not played)")
     return figure
 
 
@@ -210,9 +210,10 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         ax.yaxis.set_major_formatter(PLAIN)
         ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
+    units = f"{found.dead_units:.0%} of the trunk's {found.n_units} units are constant (dead)"
     ax.set_title(
         f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n"
-        f"{found.dead_units:.0%} of the trunk's {found.n_units} units are dead, {found.dormant_units:.0%} dormant",
+        f"{units}, {found.dormant_units:.0%} nearly 0 (dormant)",
         loc="left",
     )
     return figure

@@ -83,7 +83,7 @@ def check_zoo_folder(folder: pathlib.Path) -> None:
         except (ValueError, SyntaxError):
             named.append(normalize)
     if named:
-        raise ValueError(f"{folder} must name only wrappers of {WRAPPERS}, got {', '.join(map(str, named))}. {PASS_TRUST}")
+        raise ValueError(f"{folder} must name only code of {WRAPPERS}, got {', '.join(map(str, named))}. {PASS_TRUST}")
     check_statistics(folder / "vecnormalize.pkl")
 
 

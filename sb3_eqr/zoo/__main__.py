@@ -231,7 +231,7 @@ def explanation(command: str, error: Exception) -> str | None:
         return str(error)
     if "observation space is not supported" in str(error):
         return f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these."
-    if "as action spaces but" in str(error):
+    if "as action space" in str(error):
         return f"{command}: {error}. These agents need discrete actions."
     if command in PLOTS and not isinstance(error, (AssertionError, NotImplementedError)):
         return f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each."

@@ -1,7 +1,6 @@
 """Checks of the command line before RL Zoo starts, with messages that say what to do."""
 
 import difflib
-import importlib
 import importlib.util
 import pathlib
 import sys
@@ -12,6 +11,8 @@ import gymnasium as gym
 import torch as th
 from rl_zoo3.utils import ALGOS
 
+from sb3_eqr.envs import import_packages
+
 # Prefix of an environment's name -> package that it needs, and how to install it.
 EXTRAS = {
     "ALE/": ("ale_py", '".[atari]" in a clone of the repository'),
@@ -19,11 +20,15 @@ EXTRAS = {
 }
 
 
-def nearest(name: str, legal: Iterable[str]) -> str:
+SIMILAR = 0.8  # for names of environments: "-v0" alone makes any two alike
+
+
+def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
     """
+    :param cutoff: least similarity, in [0, 1]
     :return: the end of a message: a question with the closest legal name, or ""
     """
-    found = difflib.get_close_matches(name, list(legal), n=1)
+    found = difflib.get_close_matches(name, list(legal), n=1, cutoff=cutoff)
     return f" Did you mean {found[0]!r}?" if found else ""
 
 
@@ -41,17 +46,19 @@ def check_algo(algo: str) -> None:
 
 def check_environment(env_id: str, packages: list[str]) -> None:
     """Exit with a message if the environment is not registered after these packages are imported."""
-    for package in packages:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            fail(f"--gym-packages: {package!r} cannot be imported ({error}). Install it, or correct the name.")
+    try:
+        import_packages(packages)
+    except ValueError as error:
+        fail(str(error))
     for start, (package, requirement) in EXTRAS.items():
         is_meant = env_id.startswith(start) or (start == "ALE/" and "NoFrameskip" in env_id)
         if is_meant and importlib.util.find_spec(package) is None:
             fail(f"--env: {env_id} needs {package}. Run pip install {requirement}.")
     if env_id not in gym.registry:
-        fail(f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry)}")
+        fail(
+            f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, SIMILAR)} "
+            "Environments of another package need --gym-packages PACKAGE."
+        )
 
 
 def check_machine(device: str, track: bool, tensorboard_log: str) -> None:

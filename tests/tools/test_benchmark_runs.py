@@ -76,6 +76,23 @@ def stop_at(monkeypatch, *steps):
     monkeypatch.setattr(training.RunCallback, "_on_step", step_or_stop)
 
 
+def test_environments_of_a_package(tmp_path, monkeypatch):
+    """Registered when the package is imported, in the process of the run; a package that is missing is named."""
+    (tmp_path / "grid_package.py").write_text(
+        "import gymnasium\nfrom gymnasium.envs.classic_control import CartPoleEnv\n"
+        "gymnasium.register('OwnPole-v0', CartPoleEnv, max_episode_steps=40)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    run = make_run(tmp_path, "dqn", game="OwnPole-v0")
+    try:
+        assert execute(run, Settings(gym_packages=["grid_package"])) == "finished"
+    finally:
+        gym.registry.pop("OwnPole-v0", None)
+    assert len(result_of(run)["evaluations"][-1]["scores"]) == 5
+    with pytest.raises(ValueError, match=r"--gym-packages: 'no_package' cannot be imported .* add its folder to PYTHONPATH"):
+        execute(make_run(tmp_path / "other", "dqn"), Settings(gym_packages=["no_package"]))
+
+
 @pytest.mark.parametrize("algo", AGENTS)
 def test_an_interrupted_run_has_the_scores_of_an_uninterrupted_one(algo, tmp_path, monkeypatch):
     undisturbed = make_run(tmp_path / "undisturbed", algo)

@@ -233,10 +233,13 @@ def test_differences_in_words(tmp_path):
     assert analysis.comparison.agents[0] == "dqn" and pairs >= {(BASE, "dqn"), (FULL, "dqn")} and len(pairs) == 3
     words = [difference_in_words(row, analysis.comparison) for row in rows]
     far = metrics.aggregate_iqm(matrix(BASE)) - metrics.aggregate_iqm(matrix("dqn"))
-    assert words[0].startswith(f"{BASE} is better than dqn: its IQM is {far:.2f} above, and 3 runs on 3 games can detect ")
+    assert words[0].startswith(f"{BASE} is better than dqn: its IQM is {far:.2f} higher; 3 runs on 3 games can detect ")
     near = metrics.aggregate_iqm(matrix(BASE)) - metrics.aggregate_iqm(matrix(FULL))
-    assert "cannot be distinguished with these runs: their IQMs differ by" in words[-1]
-    assert f"differ by {abs(near):.2f}, and 3 runs on 3 games can only detect differences above " in words[-1]
+    assert "cannot be distinguished with these runs: the IQM of the first is" in words[-1]
+    assert (
+        f"{abs(near):.2f} {'lower' if near > 0 else 'higher'}, and 3 runs on 3 games can only detect differences above "
+        in words[-1]
+    )
     assert conclusion(analysis) == [
         "No agent is the best: the one with the highest IQM is not distinguished from all others.",
         *words,
@@ -340,7 +343,7 @@ def test_published_scores_are_only_shown_with_runs_of_the_same_steps(tmp_path, n
         return result
 
     text = text_of(write_report([a_benchmark(tmp_path / "a", change=change)], {}, False, tmp_path / "report", reps=5))
-    assert "Published scores are for 100,000 training steps, these runs are not" in text
+    assert "Published scores are omitted, because they are for 100,000 steps" in text
     assert "†" not in text and "superhuman games" in text
 
 

@@ -45,6 +45,8 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_qrdqn --env CartPol-v1", "Did you mean 'CartPole-v1'?"),
         ("train --algo eqr_qrdqn --env Blackjack-v1", r"Tuple\(.* observation space is not supported. Wrap the environment"),
         ("train --algo eqr_qrdqn --gym-packages nopackage", "'nopackage' cannot be imported"),
+        ("train --algo eqr_qrdqn --env Nope-v0", "gymnasium. Environments of another package need --gym-packages PACKAGE"),
+        ("train --algo eqr_qrdqn --env Pendulum-v1 -n 50", "action space.*These agents need discrete actions"),
         ("train --algo eqr_qrdqn --conf-file nofile", "--conf-file must be .* or one of .*eqr_bbf.*, got 'nofile'"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
         ("train --algo eqr_rainbow --conf-file stock/qrdqn", "'n_quantiles' is not an argument of EqRRainbow's policy"),

@@ -146,7 +146,8 @@ class ImageExtractor(BaseFeaturesExtractor):
         if min(height, width) < smallest:
             raise ValueError(
                 f"Images must have at least {smallest}x{smallest} pixels, got {height}x{width}. "
-                "Pass a features_extractor_class with smaller filters."
+                'Pass smaller filters, such as policy_kwargs=dict(features_extractor_class="nature", '
+                "features_extractor_kwargs=dict(layers=[[16, 3, 1]])), and shift_pixels=0: docs/own_environment.md."
             )
         trunk = make_trunk(channels)
         with th.no_grad():
