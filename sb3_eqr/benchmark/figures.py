@@ -159,7 +159,7 @@ def _intervals(
     )
     for ax in axes:
         ax.invert_yaxis()
-        ax.margins(x=0.08)  # a bar that ends at the edge looks cut off
+        ax.margins(x=0.08)  # bars do not touch the edge
         ax.set_title(ax.get_title(), fontsize="large")
         ax.tick_params(labelsize="medium", length=2)
         ax.set_xlabel(comparison.unit, fontsize="small")

@@ -395,9 +395,8 @@ class EqRPolicy(BasePolicy):
         ]
         with th.no_grad():
             for old, new, alpha in parts:
-                if old is None or new is None:
-                    continue
-                for parameter, drawn in zip(old.parameters(), new.parameters(), strict=True):
+                pairs = () if old is None or new is None else zip(old.parameters(), new.parameters(), strict=True)
+                for parameter, drawn in pairs:
                     if parameter.requires_grad:
                         parameter.copy_(alpha * parameter + (1 - alpha) * drawn if alpha > 0 else drawn)
         self.optimizer.state.clear()
