@@ -1,11 +1,12 @@
 """
-How much the latent state x₀ varies at initialisation, and which gradients reach it in the first updates.
+How much the latent state x₀ varies at initialisation and later, and which gradients reach it in the first updates.
 
     python -m benchmarks.state_signal --games Krull Pong MsPacman --json docs/results/state_signal.json
 
 Spread over states: the root mean square distance from the mean state. Logits: the standard deviation over states without
 noise, and over samples of the head's noise at one state, each as root mean square over atoms and actions. Gradients: their
-norms where the losses meet, medians over the updates (train/td_state_gradient, train/aux_state_gradient).
+norms where the losses meet, medians over the updates (train/td_state_gradient, train/aux_state_gradient). Later, after
+``--later`` updates: the spread over the constant part, and the skill of the predictions one and five steps ahead.
 """
 
 import argparse
@@ -19,8 +20,19 @@ import torch as th
 from sb3_eqr import EqRRainbow, envs
 from sb3_eqr.common.objective import LossCoefs
 from sb3_eqr.configurations import load_configuration
+from sb3_eqr.visualize.diagnostics import diagnose
+from sb3_eqr.visualize.latents import replayed
 
 N_DRAWS = 32  # samples of noise
+N_WINDOWS = 512  # for the skill
+CHANGES: dict[str, dict[str, Any]] = {  # name -> arguments that differ from those of EqRRainbow("CnnPolicy", env)
+    "default": {},
+    "no_centring": {"policy_kwargs": {"center": False}},
+    "random_actions": {},  # κ and ρ start with PyTorch's initial weights
+    "neither": {"policy_kwargs": {"center": False}},  # no centring, random actions
+    "no_losses": {"aux_gradient_share": 0.0, "policy_kwargs": {"center": False}},  # as "neither"; only TD trains the encoder
+}
+FAR = ("random_actions", "neither", "no_losses")
 
 
 @th.no_grad()
@@ -69,25 +81,40 @@ def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
     return {"td": float(np.median(td)), "auxiliary": float(np.median(auxiliary)), "ratio": float(np.median(auxiliary / td))}
 
 
-def measure(game: str, changes: dict[str, Any], configuration: str, n_updates: int, n_frames: int) -> dict[str, Any]:
+def later(model: EqRRainbow) -> dict[str, float]:
+    """
+    :param model: an agent after some updates
+    :return: spread of the latent states over their size, skill one and M steps ahead
+    """
+    found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
+    return {"relative_spread": found.collapse.spread, "skill_1": found.loss.skill[0], "skill_5": found.loss.skill[-1]}
+
+
+def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frames: int) -> dict[str, Any]:
     """
     :param game: an Atari game
-    :param changes: arguments of the agent that override the configuration's
-    :param configuration: a file of ``zoo_hyperparams``, or "default" for ``EqRRainbow("CnnPolicy", env)``
+    :param configuration: a file of ``zoo_hyperparams`` or a key of ``CHANGES``
     :return: a row
     """
     th.manual_seed(0)
     env = envs.make_atari100k_env(game, seed=0)
-    arguments = changes if configuration == "default" else load_configuration(configuration, **changes)
+    arguments = CHANGES[configuration] if configuration in CHANGES else load_configuration(configuration)
     model = EqRRainbow(
         "CnnPolicy", env, seed=0, device="cpu", **{**arguments, "buffer_size": 4_000, "learning_starts": n_frames}
     )
+    if configuration in FAR:
+        networks: tuple[Any, ...] = model.policy.latent_model.transition, model.policy.latent_model.action_symmetry
+        for *_, last in networks:
+            last.reset_parameters()
     model.learn(n_frames)
     assert model.replay_buffer is not None
     observations = model.replay_buffer.sample(256).observations
     found = signal(model, observations.numpy())  # type: ignore[union-attr]
     if model.depth:
         found |= gradients(model, n_updates)
+    if n_later > n_updates:
+        model.train(n_later - n_updates, model.batch_size)
+        found |= later(model)
     return {"game": game, "configuration": configuration, **{key: float(f"{value:.4g}") for key, value in found.items()}}
 
 
@@ -95,15 +122,16 @@ def main() -> None:
     """Parse the command line, measure, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--games", nargs="+", default=["Krull", "Pong", "MsPacman"])
-    parser.add_argument("--configurations", nargs="+", default=["paper", "default"])
-    parser.add_argument("--updates", type=int, default=90)
+    parser.add_argument("--configurations", nargs="+", default=["paper", *CHANGES])
+    parser.add_argument("--updates", type=int, default=90, help="for the gradients")
+    parser.add_argument("--later", type=int, default=500, help="updates before spread and skill are measured; 0: not")
     parser.add_argument("--frames", type=int, default=1_000, help="frames of random actions to train on")
     parser.add_argument("--json", type=pathlib.Path, help="write all rows here")
     arguments = parser.parse_args()
     rows = []
     for game in arguments.games:
         for configuration in arguments.configurations:
-            rows.append(measure(game, {}, configuration, arguments.updates, arguments.frames))
+            rows.append(measure(game, configuration, arguments.updates, arguments.later, arguments.frames))
             print(rows[-1], flush=True)
     if arguments.json:
         arguments.json.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")

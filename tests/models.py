@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import pytest
+import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.objective import LossCoefs
+from sb3_eqr.common.rollout import HiddenLayer
 
 SMALL = {
     "learning_starts": 40,
@@ -49,6 +51,16 @@ EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRai
 def loss_terms(model, samples):
     """The loss terms of an update on these samples."""
     return model.objective(samples, LossCoefs(model.td_coef, model.aet_coef, model.symmetry_coef, model.reward_coef))
+
+
+def untrained(model, before):
+    """
+    The names of the trainable parameters that equal those of the state dict ``before``. Batch norm subtracts the bias of the
+    layer before it, so such a bias has no gradient, and may stay.
+    """
+    without_gradient = {f"{name}.0.bias" for name, module in model.policy.named_modules() if isinstance(module, HiddenLayer)}
+    trainable = {name: p for name, p in model.policy.named_parameters() if p.requires_grad and name not in without_gradient}
+    return [name for name, parameter in trainable.items() if th.equal(before[name], parameter)]
 
 
 def train_on(model, samples):

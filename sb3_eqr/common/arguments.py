@@ -131,6 +131,7 @@ POLICY: dict[str, Rule] = {
     "parameterization": TEXT,
     "whiten": FLAG,
     "layer_norm": FLAG,
+    "center": FLAG,
     "head_input": one_of(["state", "trunk"]),
     "dueling": FLAG,
     "noisy": FLAG,

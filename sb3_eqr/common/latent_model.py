@@ -6,8 +6,9 @@ Shapes: B batch size, M prediction depth, K blocks, D size of the flat latent st
 """
 
 from collections.abc import Callable
+from copy import deepcopy
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
 
 import torch as th
 from torch import nn
@@ -18,6 +19,8 @@ from sb3_eqr.common.losses import contrastive_loss, normalized_distance, reward_
 from sb3_eqr.common.rollout import HiddenLayer, rollout
 from sb3_eqr.common.type_aliases import LatentLosses
 
+Module = TypeVar("Module", bound=nn.Module)
+NEAR_IDENTITY = 0.01  # initial outputs of κ and ρ around the identity, relative to PyTorch's default (docs/gradients.md)
 Projection = Callable[[th.Tensor], th.Tensor]
 
 # name -> (outputs of the reward network, loss)
@@ -163,6 +166,16 @@ class GroupLatentModel(LatentModel):
             self.transition = nn.Sequential(*layers)
         self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim)  # ρ
         self.projection = nn.Linear(state_dim, hidden_dim)  # b
+        if group.has_inverse:
+            self._start_near_identity()
+
+    @th.no_grad()
+    def _start_near_identity(self) -> None:
+        """Scale the initial outputs of κ and ρ: one step moves a state a little, which random moves would drown out."""
+        networks: tuple[Any, ...] = self.transition, self.action_symmetry
+        for *_, last in networks:
+            last.weight.mul_(NEAR_IDENTITY)
+            last.bias.copy_(self.group.identity_params().repeat(self.n_blocks))
 
     def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -214,3 +227,13 @@ class GroupLatentModel(LatentModel):
     def element(self, params: th.Tensor) -> th.Tensor:
         """Group elements, (B, K, *element_shape), from their parameters, (B, K * num_params)."""
         return self.group.element(params.view(-1, self.n_blocks, self.group.num_params))
+
+
+def frozen_copy(module: Module) -> Module:
+    """A copy in eval mode whose parameters are not trained. Omits modules that targets do not need (r_ψ, ρ)."""
+    copy = deepcopy(module)
+    if isinstance(copy, LatentModel):
+        del copy.reward_net
+        if isinstance(copy, GroupLatentModel):
+            del copy.action_symmetry
+    return copy.requires_grad_(False).eval()

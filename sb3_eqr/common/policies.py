@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable
-from copy import deepcopy
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -15,7 +14,7 @@ from torch import nn
 from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import Group, NoGroup
-from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection
+from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection, frozen_copy
 from sb3_eqr.common.networks.encoders import (
     DEFAULT_GROUP,
     ConvTrunk,
@@ -26,19 +25,18 @@ from sb3_eqr.common.networks.encoders import (
     NormalizedExtractor,
     find_trunk,
 )
-from sb3_eqr.common.networks.layers import DistributionalHead, Whitening
+from sb3_eqr.common.networks.layers import Centering, DistributionalHead, Whitening
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.optimizers import decay_matrices_only, find_optimizer
 from sb3_eqr.common.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_names
 
-Module = TypeVar("Module", bound=nn.Module)
 Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
-OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "head_input", "dueling", "noisy"]
-OWN_ARGUMENTS += ["sigma_init", "transition", "latent_hidden_dim", "projection", "predictor", "latent_tau"]
+OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "center", "head_input", "dueling"]
+OWN_ARGUMENTS += ["noisy", "sigma_init", "transition", "latent_hidden_dim", "projection", "predictor", "latent_tau"]
 OWN_ARGUMENTS += ["state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
 
 
@@ -74,6 +72,7 @@ class EqRPolicy(BasePolicy):
     :param whiten: whether to whiten the encoder's algebra parameters over the batch: states cannot collapse to a point, and
         blocks are decorrelated; needs a group
     :param layer_norm: whether to apply layer norm to the trunk's features, with or without a group
+    :param center: whether to subtract the features' running mean before the layer norm; unused without layer norm
     :param head_input: input of the Q head: "state", the group elements (the paper), or "trunk", the trunk's features; only the
         latent model then uses group elements, and the AET loss needs ``projection="own"`` or "none"
     :param dueling: whether to use value and advantage streams
@@ -126,6 +125,7 @@ class EqRPolicy(BasePolicy):
         parameterization: str = "euler",
         whiten: bool = False,
         layer_norm: bool = True,
+        center: bool = True,
         head_input: str = "trunk",
         dueling: bool = True,
         noisy: bool = True,
@@ -157,6 +157,7 @@ class EqRPolicy(BasePolicy):
         self.parameterization = parameterization
         self.whiten = whiten
         self.layer_norm = layer_norm
+        self.center = center
         self.head_input = head_input
         self.predictor = predictor
         self.latent_tau = latent_tau
@@ -207,8 +208,9 @@ class EqRPolicy(BasePolicy):
             )
         if self.group is None or self.head_input == "trunk":
             trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
-            return NormalizedExtractor(trunk) if self.layer_norm else trunk
-        group_kwargs = {**self._group_kwargs, "layer_norm": self.layer_norm, "normalized_image": not self.normalize_images}
+            return NormalizedExtractor(trunk, self.center) if self.layer_norm else trunk
+        group_kwargs = {name: getattr(self, name) for name in ("layer_norm", "center")} | self._group_kwargs
+        group_kwargs["normalized_image"] = not self.normalize_images
         if is_encoder:
             return self.features_extractor_class(self.observation_space, **{**group_kwargs, **trunk_kwargs})
         return GroupFeaturesExtractor(
@@ -243,12 +245,12 @@ class EqRPolicy(BasePolicy):
         super()._build(lr_schedule)  # type: ignore[misc]
         encoder = self.online.features_extractor
         self.latent_model = self._make_latent_model(encoder).to(self.device)
-        self.latent_model_target = _frozen_copy(self.latent_model)
+        self.latent_model_target = frozen_copy(self.latent_model)
         parameters = list(self.latent_model.parameters())
         self.own_projection = self.own_projection_target = None
         if self.projection == "own":
             self.own_projection = nn.Linear(self.state_dim, self.latent_hidden_dim).to(self.device)
-            self.own_projection_target = _frozen_copy(self.own_projection)
+            self.own_projection_target = frozen_copy(self.own_projection)
             parameters += self.own_projection.parameters()
         self.predictor_net = None
         if self.predictor:
@@ -258,13 +260,14 @@ class EqRPolicy(BasePolicy):
         for module in self.modules():
             if isinstance(module, ConvTrunk):
                 module.to_channels_last()
+        self._centerings = [module for module in self.online.modules() if isinstance(module, Centering)]
         depend_on_mode = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, nn.RReLU, Whitening)
         self._encoder_ignores_mode, self._states_ignore_mode = (
             not any(isinstance(module, depend_on_mode) for part in parts for module in part.modules())
             for parts in ([encoder], [encoder, self.latent_model.embedding])
         )
         is_online = self.latent_tau == 1 and self._states_ignore_mode  # a copy would be identical
-        self.latent_network_target = None if self.latent_tau is None or is_online else _frozen_copy(self.online)
+        self.latent_network_target = None if self.latent_tau is None or is_online else frozen_copy(self.online)
         self._make_target_copies()
         # One optimiser, so that SB3's learning-rate schedule and saving work unchanged.
         self.optimizer.param_groups[0]["params"] += parameters  # one group is one kernel
@@ -370,8 +373,10 @@ class EqRPolicy(BasePolicy):
         self.target_copy.update(tau)
 
     def after_gradient_step(self) -> None:
-        """Note that the targets are no longer exact copies, and update the latent model's target."""
+        """Note that the targets are no longer exact copies; update running means and the latent model's target."""
         self.target_copy.is_exact = self.latent_target_copy.is_exact = False
+        for module in self._centerings:
+            module.update()
         if self.latent_tau is not None:
             self.latent_target_copy.update(self.latent_tau)
 
@@ -438,13 +443,3 @@ def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
             f'got {type(trunk).__name__}. Pass features_extractor_class="nature" or "impala" without features_dim.'
         )
     return trunk.map_shape
-
-
-def _frozen_copy(module: Module) -> Module:
-    """A copy in eval mode whose parameters are not trained. Omits modules that targets do not need (r_ψ, ρ)."""
-    copy = deepcopy(module)
-    if isinstance(copy, LatentModel):
-        del copy.reward_net
-        if isinstance(copy, GroupLatentModel):
-            del copy.action_symmetry
-    return copy.requires_grad_(False).eval()

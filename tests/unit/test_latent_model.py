@@ -241,6 +241,24 @@ def test_every_group_trains(group):
     assert th.isfinite(state.grad).all() and all(th.isfinite(p.grad).all() for p in model.parameters())
 
 
+@pytest.mark.parametrize("group", ["SE(2)", "SO(3)", "GL(2)", "T(2)", "SE(2)^2 x SO(3)"])
+@pytest.mark.parametrize("state_dependent", [True, False])
+def test_a_new_model_moves_states_a_little(group, state_dependent):
+    """With PyTorch's initial weights, κ would move them ten times as far."""
+    th.manual_seed(0)
+    model = GroupLatentModel(make_group(group), 4, 3, state_dependent_actions=state_dependent)
+    elements = model.group.element(0.3 * th.randn(64, 4, model.group.num_params)).flatten(1)
+
+    def motion():
+        moved = model.rollout(elements, th.arange(64)[:, None] % 3)[:, 0]
+        return ((moved - elements).norm() / elements.norm()).item()
+
+    near = motion()
+    for layers in (model.transition, model.action_symmetry):
+        layers[-1].reset_parameters()
+    assert 0 < near < 0.05 and motion() > 10 * near
+
+
 def test_losses_and_gradients_of_a_singular_state_are_finite():
     made = make_group("GL(2)")
     model = GroupLatentModel(made, 2, 3)

@@ -5,7 +5,7 @@ from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.networks.encoders import ConvTrunk, GroupLayer
-from sb3_eqr.common.networks.layers import DistributionalHead, NoisyLinear, Whitening, draw_noise
+from sb3_eqr.common.networks.layers import Centering, DistributionalHead, NoisyLinear, Whitening, draw_noise
 
 
 def test_noise_is_factorised_and_redrawn():
@@ -159,6 +159,31 @@ def test_whitening_is_finite_for_equal_features_and_for_few_samples():
 def test_whitening_has_a_correct_gradient():
     th.manual_seed(1)
     assert th.autograd.gradcheck(Whitening(3).double(), th.randn(5, 3, dtype=th.float64, requires_grad=True))
+
+
+def test_the_running_mean_by_hand():
+    """Weights of the batches: 1, 1/2, then 0.4 where 1/3 would be less."""
+    layer, batches = Centering(2, momentum=0.4).double(), th.randn(3, 5, 2, dtype=th.float64)
+    expected = np.zeros(2)
+    for batch, weight in zip(batches.numpy(), (1.0, 0.5, 0.4), strict=True):
+        for _ in range(2):  # a call does not change what the next one of the same update subtracts
+            np.testing.assert_allclose(layer(th.tensor(batch)), batch - expected, atol=1e-12)
+        with th.no_grad():
+            layer(th.randn(5, 2, dtype=th.float64))  # such as encodings for the target
+        layer.update()
+        expected = (1 - weight) * expected + weight * batch.mean(axis=0)
+    layer.eval()
+    layer(batches[0])
+    layer.update()
+    np.testing.assert_allclose(layer.running_mean, expected, atol=1e-12)
+
+
+def test_no_gradient_flows_through_the_mean():
+    layer, features = Centering(3), th.randn(5, 3, requires_grad=True)
+    layer(features)
+    layer.update()
+    layer(features).sum().backward()
+    assert th.equal(features.grad, th.ones(5, 3)) and not layer.running_mean.requires_grad
 
 
 def test_layers_print_their_sizes():

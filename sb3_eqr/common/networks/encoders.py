@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
-from sb3_eqr.common.networks.layers import Whitening
+from sb3_eqr.common.networks.layers import Centering, Whitening
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.common.validation import check_number
 
@@ -257,16 +257,18 @@ class NormalizedExtractor(BaseFeaturesExtractor):
     and variance 1, which is the scale that the next layers expect.
 
     :param trunk: any features extractor
+    :param center: whether to subtract the running mean of the trunk's features before the layer norm (docs/gradients.md)
     """
 
-    def __init__(self, trunk: BaseFeaturesExtractor):
+    def __init__(self, trunk: BaseFeaturesExtractor, center: bool = False):
         super().__init__(trunk._observation_space, trunk.features_dim)
         self.trunk = trunk
+        self.center = Centering(trunk.features_dim) if center else nn.Identity()
         self.norm = nn.LayerNorm(trunk.features_dim)
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """Map the trunk's input to features, (B, features_dim)."""
-        return self.norm(self.trunk(observations))
+        return self.norm(self.center(self.trunk(observations)))
 
 
 class GroupLayer(nn.Module):
@@ -328,6 +330,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param parameterization: parameterization of rotations
     :param whiten: whether to whiten the algebra parameters over the batch
     :param layer_norm: whether to apply layer norm to the trunk's features
+    :param center: whether to subtract their running mean before the layer norm; unused without layer norm
     :param trunk_class: features extractor before the linear layer, or its name in ``TRUNKS``; ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments
@@ -344,6 +347,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         parameterization: str = "euler",
         whiten: bool = False,
         layer_norm: bool = False,
+        center: bool = False,
         trunk_class: str | type[BaseFeaturesExtractor] | None = None,
         trunk_kwargs: dict[str, Any] | None = None,
         normalized_image: bool = False,
@@ -358,7 +362,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         if features_dim is not None:
             trunk_kwargs["features_dim"] = features_dim
         trunk = found(observation_space, **trunk_kwargs)
-        self.trunk: BaseFeaturesExtractor = NormalizedExtractor(trunk) if layer_norm else trunk
+        self.trunk: BaseFeaturesExtractor = NormalizedExtractor(trunk, center) if layer_norm else trunk
         self.group_layer = GroupLayer(trunk.features_dim, group, n_blocks, parameterization, whiten)
         self._features_dim = self.group_layer.state_dim
 

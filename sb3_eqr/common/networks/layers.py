@@ -193,6 +193,44 @@ class DistributionalHead(nn.Module):
         return self.first(features)
 
 
+class Centering(nn.Module):
+    """
+    Subtract the running mean of the features, the part that is the same for all observations. No gradient flows through it.
+    A call in train mode that records gradients notes the mean of its batch, and :meth:`update` moves the running mean towards
+    that one, so all calls of the same update subtract the same mean.
+
+    :param n_features: D
+    :param momentum: weight of a new batch in the running mean; the first batch has weight 1. With 0.1, the mean lags behind
+        the changes of the first updates (docs/gradients.md)
+    """
+
+    running_mean: th.Tensor  # (D,)
+    running_count: th.Tensor  # batches so far
+    batch_mean: th.Tensor  # (D,)
+
+    def __init__(self, n_features: int, momentum: float = 0.3):
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("running_mean", th.zeros(n_features))
+        self.register_buffer("running_count", th.zeros(()))
+        self.register_buffer("batch_mean", th.zeros(n_features), persistent=False)
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: (B, D)
+        :return: (B, D)
+        """
+        if self.training and th.is_grad_enabled():
+            self.batch_mean.copy_(features.detach().mean(dim=0))
+        return features - self.running_mean
+
+    def update(self) -> None:
+        """Called after each gradient step; without effect in eval mode."""
+        if self.training:
+            self.running_count += 1
+            self.running_mean.lerp_(self.batch_mean, (1 / self.running_count).clamp(min=self.momentum))
+
+
 class Whitening(nn.Module):
     """
     Batch norm over all features jointly: mean 0, variance 1 and no correlations over the batch, using the Cholesky factor of
