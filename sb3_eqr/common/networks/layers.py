@@ -199,18 +199,18 @@ class Centering(nn.Module):
     A call in train mode that records gradients notes the mean of its batch, and :meth:`update` moves the running mean towards
     that one, so all calls of the same update subtract the same mean.
 
+    After n batches, the weight of a new one is 1 / (1 + 0.03 n), at least 0.01: the first updates change the mean fast, and a
+    mean that lags behind would leave what it is to remove (docs/gradients.md); later, more batches make it more precise.
+
     :param n_features: D
-    :param momentum: weight of a new batch in the running mean; the first batch has weight 1. With 0.1, the mean lags behind
-        the changes of the first updates (docs/gradients.md)
     """
 
     running_mean: th.Tensor  # (D,)
-    running_count: th.Tensor  # batches so far
+    running_count: th.Tensor  # n
     batch_mean: th.Tensor  # (D,)
 
-    def __init__(self, n_features: int, momentum: float = 0.3):
+    def __init__(self, n_features: int):
         super().__init__()
-        self.momentum = momentum
         self.register_buffer("running_mean", th.zeros(n_features))
         self.register_buffer("running_count", th.zeros(()))
         self.register_buffer("batch_mean", th.zeros(n_features), persistent=False)
@@ -227,8 +227,8 @@ class Centering(nn.Module):
     def update(self) -> None:
         """Called after each gradient step; without effect in eval mode."""
         if self.training:
+            self.running_mean.lerp_(self.batch_mean, (1 / (1 + 0.03 * self.running_count)).clamp(min=0.01))
             self.running_count += 1
-            self.running_mean.lerp_(self.batch_mean, (1 / self.running_count).clamp(min=self.momentum))
 
 
 class Whitening(nn.Module):
