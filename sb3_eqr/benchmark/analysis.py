@@ -71,9 +71,7 @@ def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.
 
 
 def conclusion(analysis: Analysis) -> list[str]:
-    """
-    :return: sentences on what the runs show, the most important first
-    """
+    """:return: sentences on what the runs show, the most important first"""
     comparison = analysis.comparison
     sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
     own = {agent: analysis.matrices[agent] for agent in comparison.agents}
@@ -124,9 +122,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def notes(analysis: Analysis) -> list[str]:
-    """
-    :return: caveats that readers need before the numbers
-    """
+    """:return: caveats that readers need before the numbers"""
     comparison = analysis.comparison
     found = [f"‡ {agent} was run under another protocol: {what}." for agent, what in comparison.differing.items()]
     found += comparison.notes
@@ -142,9 +138,7 @@ def notes(analysis: Analysis) -> list[str]:
 
 
 def table_notes(analysis: Analysis) -> list[str]:
-    """
-    :return: sentences on what the table of games shows
-    """
+    """:return: sentences on what the table of games shows"""
     comparison = analysis.comparison
     found = [
         "Raw scores: mean ± standard deviation over runs. Bold: significantly better than every other agent.",
@@ -158,9 +152,7 @@ def table_notes(analysis: Analysis) -> list[str]:
 
 
 def aggregates_file(analysis: Analysis) -> pd.DataFrame:
-    """
-    :return: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs
-    """
+    """:return: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs"""
     comparison = analysis.comparison
     above = [(agent, comparison.above_one, statistics.games_above(matrix)) for agent, matrix in analysis.matrices.items()]
     own = pd.concat([analysis.aggregates, pd.DataFrame(above, columns=["agent", "metric", "value"])], ignore_index=True)

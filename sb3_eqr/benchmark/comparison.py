@@ -167,9 +167,7 @@ def _read_suite(folder: pathlib.Path) -> Suite:
 
 
 def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
-    """
-    :raises ValueError: for a folder without finished runs, or a run that is in two folders
-    """
+    """:raises ValueError: for a folder without finished runs, or a run that is in two folders"""
     results: list[dict[str, Any]] = []
     where: dict[tuple, pathlib.Path] = {}
     for folder in map(pathlib.Path, folders):

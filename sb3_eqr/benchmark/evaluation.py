@@ -104,17 +104,11 @@ def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: in
     """
     # Monitor is outside the wrappers, so that it sees the protocol's episodes.
     env = make_vec_env(make_game, n_envs=protocol["evaluation"]["n_envs"], seed=seed, env_kwargs={"protocol": protocol})
-    trained = model.get_vec_normalize_env()
-    if trained is not None:
-        env = VecNormalize(
-            env,
-            training=False,
-            norm_obs=trained.norm_obs,
-            norm_reward=False,
-            clip_obs=trained.clip_obs,
-            epsilon=trained.epsilon,
-        )
-        env.obs_rms = copy.deepcopy(trained.obs_rms)
+    old = model.get_vec_normalize_env()
+    if old is not None:
+        ranges: dict[str, Any] = {"clip_obs": old.clip_obs, "epsilon": old.epsilon}
+        env = VecNormalize(env, training=False, norm_obs=old.norm_obs, norm_reward=False, **ranges)
+        env.obs_rms = copy.deepcopy(old.obs_rms)
     n_stack = preprocessing_of(protocol).get("frame_stack")
     return VecFrameStack(env, n_stack) if n_stack else env
 

@@ -60,9 +60,7 @@ class ReportFigure(NamedTuple):
 
 
 def to_png(shown: ReportFigure) -> bytes:
-    """
-    :return: the figure as PNG, the same bytes for the same figure; the figure is closed
-    """
+    """:return: the figure as PNG, the same bytes for the same figure; the figure is closed"""
     file = io.BytesIO()
     for ax in shown.figure.axes:
         ax.spines[:].set_linewidth(SETTINGS["axes.linewidth"])  # rliable draws thick ones
@@ -73,9 +71,7 @@ def to_png(shown: ReportFigure) -> bytes:
 
 
 def all_figures(analysis: Analysis) -> list[ReportFigure]:
-    """
-    :return: the figures for which there is data
-    """
+    """:return: the figures for which there is data"""
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
     best = "Higher is better for IQM, median and mean, lower for the optimality gap; as Figure 5 (a) of the EqR paper."
     with settings():
@@ -100,9 +96,7 @@ def _legend(figure: Figure, style: Mapping[str, Look]) -> None:
 
 
 def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
-    """
-    :return: (n,) thresholds of the profiles: from 0, or lower if many scores are, to where few scores are left
-    """
+    """:return: (n,) thresholds of the profiles: from 0, or lower if many scores are, to where few scores are left"""
     scores = np.concatenate([matrix.ravel() for matrix in matrices.values()])
     low = min(0.0, float(np.quantile(scores, 0.1)))
     return np.linspace(low, max(1.0, low + 1.0, 1.05 * float(np.quantile(scores, 0.975))), N_THRESHOLDS)
@@ -304,28 +298,20 @@ def _rows(run: dict[str, Any], comparison: Comparison, steps: np.ndarray, values
 
 
 def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
+    scores, losses = learning_curves(comparison), symmetry_losses(comparison)
+    about_scores = "Raw scores of the evaluations during training."
+    about_losses = "L_AET + L_GET during training, as Figure 7 of the EqR paper; for agents with only one of them, that one."
     found = []
-    for name, title, table, ylabel, caption in (
-        (
-            "learning_curves",
-            "Learning curves",
-            learning_curves(comparison),
-            "mean raw score",
-            "Raw scores of the evaluations during training.",
-        ),
-        (
-            "symmetry_losses",
-            "Symmetry losses",
-            symmetry_losses(comparison),
-            "$L_{AET} + L_{GET}$",
-            "L_AET + L_GET during training, as Figure 7 of the EqR paper; for agents with only one of them, that one.",
-        ),
+    for name, table, ylabel, caption in (
+        ("learning curves", scores, "mean raw score", about_scores),
+        ("symmetry losses", losses, "$L_{AET} + L_{GET}$", about_losses),
     ):
         if len(table):
             band = " Means over runs ± one standard deviation."
             band = band if table["seed"].nunique() > 1 else " A single run each."
             shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
-            found.append(ReportFigure(name, title, caption + band, _small_multiples(table, ylabel, shown)))
+            figure = _small_multiples(table, ylabel, shown)
+            found.append(ReportFigure(name.replace(" ", "_"), name.capitalize(), caption + band, figure))
     return found
 
 

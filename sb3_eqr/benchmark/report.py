@@ -17,16 +17,7 @@ from sb3_eqr.benchmark.comparison import Comparison, compare
 from sb3_eqr.benchmark.figures import all_figures, to_png
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.statistics import REPS
-from sb3_eqr.benchmark.tables import (
-    Table,
-    game_table,
-    make_table,
-    number,
-    summary_table,
-    to_html,
-    to_latex,
-    to_markdown,
-)
+from sb3_eqr.benchmark.tables import Table, game_table, make_table, number, summary_table, to_html, to_latex, to_markdown
 from sb3_eqr.common.files import atomic_write
 
 TEMPLATE = pathlib.Path(__file__).with_name("report.html.jinja")
@@ -111,13 +102,8 @@ def _lead(comparison: Comparison) -> str:
 
 
 def _data_files(episodes: pd.DataFrame, aggregates: pd.DataFrame) -> dict[str, bytes]:
-    """
-    :return: name -> content; without scores.parquet if pandas has no library to write it
-    """
-    files = {
-        "scores.csv": episodes.to_csv(index=False).encode(),
-        "aggregates.csv": aggregates.to_csv(index=False).encode(),
-    }
+    """:return: name -> content; without scores.parquet if pandas has no library to write it"""
+    files = {"scores.csv": episodes.to_csv(index=False).encode(), "aggregates.csv": aggregates.to_csv(index=False).encode()}
     buffer = io.BytesIO()
     try:
         episodes.to_parquet(buffer, index=False)
@@ -149,14 +135,9 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
             ]
         )
     header = ["agent", "seeds", "device", "threads", "minutes per run", "steps/s", "restarted runs"]
-    found = [("Runs", _html(make_table(header, rows)))]
-    for heading, path in (
-        ("Hyperparameters", ("entry", "hyperparameters")),
-        ("Protocol", ("protocol",)),
-        ("Versions", ("versions",)),
-    ):
-        found.append((heading, _html(_side_by_side(comparison, path), "words")))
-    return found
+    paths = {"Hyperparameters": ("entry", "hyperparameters"), "Protocol": ("protocol",), "Versions": ("versions",)}
+    compared = [(heading, _html(_side_by_side(comparison, path), "words")) for heading, path in paths.items()]
+    return [("Runs", _html(make_table(header, rows))), *compared]
 
 
 def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:

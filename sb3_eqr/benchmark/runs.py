@@ -152,9 +152,7 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
 
 
 def _check_plan(run: Run) -> None:
-    """
-    :raises ValueError: if the folder holds the same run, started with other settings
-    """
+    """:raises ValueError: if the folder holds the same run, started with other settings"""
     path = run.folder / PLAN
     begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or run.is_locked()
     if not (path.is_file() and begun):

@@ -102,9 +102,7 @@ class Suite(Strict):
         return self
 
     def protocol(self, game: str) -> dict[str, Any]:
-        """
-        :return: the settings that two scores must share to be comparable
-        """
+        """:return: the settings that two scores must share to be comparable"""
         return {
             "env_id": self.env_id.format(game=game),
             "steps": self.steps[game],
@@ -114,17 +112,13 @@ class Suite(Strict):
 
 
 def nearest_name(name: str, legal: Iterable[str]) -> str:
-    """
-    :return: the end of a message, with the nearest legal name and all legal names
-    """
+    """:return: the end of a message, with the nearest legal name and all legal names"""
     names = sorted(legal)
     return f"{nearest(name, names)} Choose from {', '.join(names)}."
 
 
 def human_scores(games: list[str]) -> dict[str, Any]:
-    """
-    :return: the normalisation of Atari 100K: random play 0, a human tester 1
-    """
+    """:return: the normalisation of Atari 100K: random play 0, a human tester 1"""
     table = load_reference().pivot(index="game", columns="method", values="mean")
     known = {game: table.loc[game.lower()] for game in games if game.lower() in table.index}
     scores = {game: [float(row[RANDOM]), float(row[HUMAN])] for game, row in known.items()}
@@ -221,7 +215,5 @@ def write_suite(suite: Suite, path: pathlib.Path) -> None:
 
 
 def read_suite(path: pathlib.Path) -> Suite:
-    """
-    :param path: a file written by :func:`write_suite`
-    """
+    """:param path: a file written by :func:`write_suite`"""
     return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))

@@ -148,11 +148,7 @@ def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: Ma
 
 
 def game_table(
-    comparison: Comparison,
-    aggregates: pd.DataFrame,
-    matrices: Mapping[str, np.ndarray],
-    means: pd.DataFrame,
-    reps: int,
+    comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], means: pd.DataFrame, reps: int
 ) -> Table:
     """
     A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below.

@@ -36,18 +36,7 @@ from sb3_eqr.zoo import register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
 PROGRESS_SECONDS = 2.0  # between writes of a run's progress
-PACKAGES = (
-    "sb3-eqr",
-    "stable-baselines3",
-    "sb3-contrib",
-    "rl_zoo3",
-    "torch",
-    "gymnasium",
-    "ale-py",
-    "minatar",
-    "numpy",
-    "ray",
-)
+PACKAGES = "sb3-eqr stable-baselines3 sb3-contrib rl_zoo3 torch gymnasium ale-py minatar numpy ray".split()
 
 
 def new_record() -> dict[str, Any]:
@@ -75,12 +64,8 @@ class LossWriter(KVWriter):
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Append what was logged; the interface of SB3's writers."""
-        kept = {
-            key: value
-            for key, value in key_values.items()
-            if re.fullmatch(LOGGED, key) and isinstance(value, (int, float, np.number))
-        }
-        row = {key.removeprefix("train/"): float(value) for key, value in kept.items()}
+        numbers = {key: float(value) for key, value in key_values.items() if isinstance(value, (int, float, np.number))}
+        row = {key.removeprefix("train/"): value for key, value in numbers.items() if re.fullmatch(LOGGED, key)}
         if row:
             self._losses.append({"step": step, **row})
 
@@ -142,9 +127,9 @@ class RunCallback(BaseCallback):
     def _on_step(self) -> bool:
         for info in self.locals.get("infos", []):
             if "episode" in info:
-                self.record["training"]["step"].append(self.num_timesteps)
-                self.record["training"]["score"].append(float(info["episode"]["r"]))
-                self.record["training"]["length"].append(int(info["episode"]["l"]))
+                found = {"step": self.num_timesteps, "score": float(info["episode"]["r"]), "length": int(info["episode"]["l"])}
+                for key, value in found.items():
+                    self.record["training"][key].append(value)
         if time.monotonic() - self.noted >= PROGRESS_SECONDS:
             self.clock.read("training_seconds")
             self.note_progress()
@@ -159,9 +144,7 @@ class RunCallback(BaseCallback):
         self.note_progress()
 
     def is_due(self) -> bool:
-        """
-        :return: whether a point of the learning curve has been reached since the last evaluation
-        """
+        """:return: whether a point of the learning curve has been reached since the last evaluation"""
         last = max((row["step"] for row in self.record["evaluations"]), default=0)
         return any(last < step <= self.num_timesteps < self.steps for step in self.due)
 
@@ -259,9 +242,7 @@ def remove_checkpoints(folder: pathlib.Path) -> None:
 
 
 def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
-    """
-    :return: what was run, with versions and machine
-    """
+    """:return: what was run, with versions and machine"""
     versions = {}
     for package in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):

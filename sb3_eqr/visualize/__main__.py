@@ -25,9 +25,7 @@ FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # argument of play -> flag
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """
-    :return: the parser of the command
-    """
+    """:return: the parser of the command"""
     parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
     parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file written by an agent's save")
     parser.add_argument("--env", help="gymnasium id (default: from RL Zoo's files next to MODEL)")
@@ -95,9 +93,7 @@ def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dic
 
 
 def write_video(model: EqRAlgorithm, env: VecEnv, folder: pathlib.Path, depth: int, args: argparse.Namespace) -> None:
-    """
-    :param folder: folder for play.mp4 and play.gif
-    """
+    """:param folder: folder for play.mp4 and play.gif"""
     from sb3_eqr.visualize.animation import record  # only videos need its libraries
 
     record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)

@@ -84,9 +84,7 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
 
 
 def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators]:
-    """
-    :param elements: κ of every action in n states, (n, A, D)
-    """
+    """:param elements: κ of every action in n states, (n, A, D)"""
     found = []
     for group, blocks in split(model, elements):
         values = coordinates(group, blocks)  # (n, A, K, C)

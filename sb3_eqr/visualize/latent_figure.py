@@ -63,16 +63,12 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
 
 
 def n_columns(count: int) -> int:
-    """
-    :param count: number of panels
-    """
+    """:param count: number of panels"""
     return 4 if count > 4 else min(count, 2)
 
 
 def panels(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
-    """
-    :return: ``count`` axes, in rows of at most four
-    """
+    """:return: ``count`` axes, in rows of at most four"""
     columns = n_columns(count)
     rows = -(-count // columns)
     axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey).flatten().tolist()

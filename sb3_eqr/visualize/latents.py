@@ -264,9 +264,7 @@ def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
 
 
 def coordinate_names(group: Group) -> list[str]:
-    """
-    :return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... if elements are not matrices
-    """
+    """:return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... if elements are not matrices"""
     matrix, vector = frame(group, th.zeros(group.element_shape))
     names = []
     if matrix is not None:
@@ -300,9 +298,7 @@ def _is_own(group: Group) -> bool:
 
 
 def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
-    """
-    :return: (n_envs, F); ``None`` if an environment does not report its true state
-    """
+    """:return: (n_envs, F); ``None`` if an environment does not report its true state"""
     found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
     return np.array([np.concatenate(row) for row in found]) if all(found) else None
 

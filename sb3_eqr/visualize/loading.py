@@ -149,16 +149,8 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
     hyperparams, stats_path = get_saved_hyperparams(str(folder))
     norm_reward = (hyperparams.get("normalize_kwargs") or {}).get("norm_reward", True)
     made_with = {**(arguments.get("env_kwargs") or {}), **({"render_mode": "rgb_array"} if render else {}), **kwargs}
-    env = create_test_env(
-        arguments["env"],
-        n_envs,
-        stats_path,
-        seed,
-        should_render=False,
-        hyperparams=hyperparams,
-        env_kwargs=made_with,
-        vec_env_cls=DummyVecEnv,
-    )
+    options: dict[str, Any] = {"should_render": False, "env_kwargs": made_with, "vec_env_cls": DummyVecEnv}
+    env = create_test_env(arguments["env"], n_envs, stats_path, seed, hyperparams=hyperparams, **options)
     normalize = unwrap_vec_normalize(env)
     if normalize is not None:
         normalize.norm_reward = norm_reward  # the reward predictor was trained on these rewards
@@ -196,9 +188,7 @@ def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
 
 
 def action_names(env: VecEnv, n_actions: int) -> list[str]:
-    """
-    :return: the environment's names of its actions, or else their numbers
-    """
+    """:return: the environment's names of its actions, or else their numbers"""
     world = env.get_attr("unwrapped", 0)[0]
     names = world.get_action_meanings() if hasattr(world, "get_action_meanings") else []
     return list(names) if len(names) == n_actions else [str(a) for a in range(n_actions)]

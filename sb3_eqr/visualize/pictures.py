@@ -149,23 +149,12 @@ def _generator(ax: Axes, part: Generators, k: int, drawn: dict[str, Any]) -> Non
     ax.axhline(0, color=GREY, linewidth=0.6)
     ax.set_xlim(-0.6, len(part.mean) - 0.4)
     largest = np.argsort(-np.abs(part.mean[:, k]).sum(axis=0), kind="stable")[:MAX_COORDINATES]
-    n_actions = len(part.mean)
     for i, c in enumerate(sorted(largest)):
         shift = (i - (len(largest) - 1) / 2) * 0.6 / max(len(largest), 2)  # so that bars do not hide each other
         name = part.names[c] if len(largest) == len(part.names) else f"coordinate {i + 1} of {MAX_COORDINATES}"
-        drawn.setdefault(
-            name,
-            ax.errorbar(
-                np.arange(n_actions) + shift,
-                part.mean[:, k, c],
-                part.std[:, k, c],
-                color=COLORS[i],
-                marker=MARKERS[i],
-                linestyle="",
-                markersize=3,
-                elinewidth=1,
-            ),
-        )
+        x, looks = np.arange(len(part.mean)) + shift, {"color": COLORS[i], "markersize": 3, "elinewidth": 1}
+        bars = ax.errorbar(x, part.mean[:, k, c], part.std[:, k, c], fmt=MARKERS[i], **looks)  # type: ignore[arg-type]
+        drawn.setdefault(name, bars)
 
 
 def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()) -> Figure:
@@ -195,12 +184,8 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
     seen = found.spectrum[found.spectrum > found.spectrum[0] * ROUNDING]  # the rest is rounding
     seen = seen if len(seen) else found.spectrum
     ax.plot(np.arange(1, len(seen) + 1), seen, color=COLORS[0], marker="o", markersize=3, linewidth=1)
-    ax.axvline(
-        found.effective_rank,
-        color=COLORS[1],
-        linestyle="--",
-        label=f"effective rank {found.effective_rank:.1f} of {found.dimensions}",
-    )
+    label = f"effective rank {found.effective_rank:.1f} of {found.dimensions}"
+    ax.axvline(found.effective_rank, color=COLORS[1], linestyle="--", label=label)
     more = len(found.spectrum) - len(seen)
     ax.set(xlabel=f"principal axis{f' ({more} more are 0 up to rounding)' if more else ''}", ylabel="standard deviation")
     ax.set_xlim(0, len(seen) + 1)

@@ -103,9 +103,7 @@ def _disentanglement(diagnostics: Diagnostics, actions: Sequence[str], factors: 
 
 
 def factor_names(n_factors: int, names: Sequence[str]) -> list[str]:
-    """
-    :return: the names if their number is right, or else numbers
-    """
+    """:return: the names if their number is right, or else numbers"""
     return list(names) if len(names) == n_factors else [f"factor {i}" for i in range(n_factors)]
 
 
