@@ -31,6 +31,7 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--address", help="address of a Ray cluster that can access the folder (default: this machine)")
     run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs and PyTorch threads per run (default: 1)")
     run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs per run, such as 0.1 (default: 0)")
+    run.add_argument("--save-models", action="store_true", help="save each trained agent in models/ of its run, for enjoy -f")
     run.add_argument("--checkpoint-every", type=float, default=300.0, metavar="SECONDS", help="default: 300 seconds")
     status = commands.add_parser("status", help="progress of a benchmark")
     status.add_argument("folder", type=pathlib.Path)

@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
         n_threads=threads,
         checkpoint_seconds=args.checkpoint_every,
         gym_packages=args.gym_packages,
+        save_models=args.save_models,
     )
     failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, Console())
     for lost in failed:

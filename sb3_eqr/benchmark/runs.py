@@ -16,6 +16,7 @@ from sb3_eqr.common.files import atomic_write
 
 SUITE = "suite.yml"  # in the folder of the benchmark
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # in that of a run
+MODELS = "models"  # RL Zoo's log folder of a run
 STARTS = "starts.txt"  # a line for each time that a run starts or resumes
 
 
@@ -28,6 +29,7 @@ class Settings(Strict):
     :param n_threads: number of PyTorch threads
     :param checkpoint_seconds: seconds between checkpoints
     :param gym_packages: packages that register environments
+    :param save_models: whether to save trained agents in the format of RL Zoo
     """
 
     command: str = ""
@@ -35,6 +37,7 @@ class Settings(Strict):
     n_threads: int = 1
     checkpoint_seconds: float = 300.0
     gym_packages: list[str] = []
+    save_models: bool = False
 
 
 class State(NamedTuple):

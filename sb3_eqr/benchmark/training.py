@@ -12,6 +12,7 @@ import shutil
 import tempfile
 import time
 import traceback
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.evaluation import evaluate
-from sb3_eqr.benchmark.runs import ERROR, LOCK, PROGRESS, RESULT, STARTS, Run, Settings, write_json
+from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, Run, Settings, write_json
 from sb3_eqr.common import checkpoints
 from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints, write_checkpoint
 from sb3_eqr.common.files import atomic_write
@@ -177,25 +178,28 @@ def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind:
     record["evaluations"].append({"step": model.num_timesteps, "kind": kind, "scores": scores, "lengths": lengths})
 
 
-def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
+def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorithm, ExperimentManager]:
     """
     Build the agent as RL Zoo does, on environments that write no files.
 
-    :return: the agent and the callbacks of its entry
+    :param logs: folder for the files that RL Zoo writes next to a model
+    :return: the agent, and RL Zoo's manager, which has the callbacks of its entry and saves the agent
     """
-    with tempfile.TemporaryDirectory() as logs, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        config = pathlib.Path(logs) / "entry.yml"
-        config.write_text(yaml.safe_dump({run.protocol["env_id"]: run.entry}), encoding="utf-8")
+    env_id, kwargs = run.protocol["env_id"], run.entry.get("env_kwargs")
+    args = argparse.Namespace(env=env_id, env_kwargs=kwargs, gym_packages=settings.gym_packages, seed=run.seed)
+    with tempfile.TemporaryDirectory() as aside, silence():
+        config = pathlib.Path(aside) / "entry.yml"
+        config.write_text(yaml.safe_dump({env_id: run.entry}), encoding="utf-8")
         manager = ExperimentManager(
-            argparse.Namespace(),
+            args,
             run.agent.algo,
-            run.protocol["env_id"],
-            logs,
+            env_id,
+            str(logs),
             n_timesteps=run.protocol["steps"],
             eval_freq=-1,
             seed=run.seed,
             verbose=0,
-            device=device,
+            device=settings.device,
             config=str(config),
         )
         experiment = manager.setup_experiment()
@@ -205,7 +209,23 @@ def build(run: Run, device: str) -> tuple[BaseAlgorithm, list[BaseCallback]]:
         model.set_env(manager.create_envs(manager.n_envs, no_log=True))
         if old is not None:
             old.close()
-    return model, manager.callbacks
+    return model, manager
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Leave out what RL Zoo prints."""
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        yield
+
+
+def save_model(model: BaseAlgorithm, manager: ExperimentManager, settings: Settings, logs: pathlib.Path) -> None:
+    """Save the agent in the folder of :func:`build` as ``sb3-eqr train`` does, without its log of episodes."""
+    with silence():
+        manager.save_trained_model(model)
+    pathlib.Path(manager.params_path, "command.txt").write_text(settings.command, encoding="utf-8")
+    for log in logs.rglob("*.monitor.csv"):
+        log.unlink()
 
 
 def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[BaseAlgorithm, dict[str, Any], bool]:
@@ -236,9 +256,9 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
 
 
 def remove_checkpoints(folder: pathlib.Path) -> None:
-    """Remove the checkpoints of a finished run, and partial ones that a killed run left."""
-    for checkpoint in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*")]:
-        shutil.rmtree(checkpoint, ignore_errors=True)
+    """Remove the checkpoints of a finished run, and partial files that a killed run left."""
+    for path in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*"), folder / f".{MODELS}"]:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
@@ -264,7 +284,10 @@ def train(run: Run, settings: Settings) -> None:
     register()
     with open(run.folder / STARTS, "a", encoding="utf-8") as file:
         file.write(datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds") + "\n")
-    model, callbacks = build(run, settings.device)
+    models = run.folder / MODELS
+    logs = models.with_name(f".{MODELS}")
+    shutil.rmtree(logs, ignore_errors=True)  # of a killed run
+    model, manager = build(run, settings, logs)
     record = new_record()
     found = find_checkpoints(run.folder)
     if found:
@@ -276,7 +299,7 @@ def train(run: Run, settings: Settings) -> None:
     if model.num_timesteps < steps:
         model.set_logger(Logger(folder=None, output_formats=[LossWriter(record["losses"])]))
         callback = RunCallback(run, record, settings)
-        model.learn(steps - model.num_timesteps, [*callbacks, callback], reset_num_timesteps=not found)
+        model.learn(steps - model.num_timesteps, [*manager.callbacks, callback], reset_num_timesteps=not found)
         write_checkpoint(run.folder, model, record, with_buffer=False)
     finishing = Clock(record)
     add_evaluation(model, run, record, "final", run.protocol["evaluation"]["episodes"])
@@ -288,6 +311,10 @@ def train(run: Run, settings: Settings) -> None:
         "wall_clock_s": round(record.pop("seconds"), 2),
         "steps_per_second": round(steps / max(record["training_seconds"], 1e-9), 2),
     }
+    if settings.save_models:
+        save_model(model, manager, settings, logs)
+        shutil.rmtree(models, ignore_errors=True)
+        logs.rename(models)
     write_json(run.folder / RESULT, {**provenance(run, model, settings), **times, **record})
     model.get_env().close()  # type: ignore[union-attr]
     remove_checkpoints(run.folder)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from filelock import FileLock
+from rl_zoo3.utils import create_test_env, get_saved_hyperparams
+from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
@@ -131,6 +133,26 @@ def test_the_contents_of_the_result(tmp_path):
     assert result["wall_clock_s"] >= result["training_seconds"] > 0
     assert result["steps_per_second"] == pytest.approx(STEPS / result["training_seconds"], abs=0.01)
     assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "td_state_gradient", "step"} <= result["losses"][-1].keys()
+
+
+def test_saved_models_are_the_evaluated_agents_in_the_format_of_rl_zoo(tmp_path, monkeypatch):
+    """With the normalisation of the observations; an interrupted run leaves no second copy."""
+    run, settings = make_run(tmp_path, "dqn"), Settings(command="made by", save_models=True)
+    stop_at(monkeypatch, STEPS // 2)
+    with pytest.raises(KeyError):
+        execute(run, settings)
+    execute(run, settings)
+    assert sorted(path.name for path in run.folder.iterdir()) == [LOCK, "models", RESULT]
+    folder = run.folder / "models" / "dqn" / "CartPole-v1_1"
+    hyperparams, statistics = get_saved_hyperparams(str(folder / "CartPole-v1"))
+    env = create_test_env("CartPole-v1", stats_path=statistics, hyperparams=hyperparams)
+    model = DQN.load(folder / "CartPole-v1.zip", env=env)
+    assert model.num_timesteps == STEPS and env.obs_rms.count > STEPS
+    scores, lengths = evaluate(model, run.protocol, run.protocol["evaluation"]["episodes"], run.seed)
+    final = result_of(run)["evaluations"][-1]
+    assert (scores, lengths) == (final["scores"], final["lengths"])
+    assert yaml.unsafe_load((folder / "CartPole-v1" / "args.yml").read_text())["env"] == "CartPole-v1"
+    assert (folder / "CartPole-v1" / "command.txt").read_text() == "made by"
 
 
 def test_evaluations_do_not_change_training(tmp_path):
