@@ -81,6 +81,8 @@ def conclusion(analysis: Analysis) -> list[str]:
         sentences.insert(0, f"{comparison.label(best)} is the best agent: these runs distinguish it from every other one.")
     elif len(own) > 2:
         sentences.insert(0, "No agent is the best: the one with the highest IQM is not distinguished from all others.")
+    if any(abs(row["difference"]) < row["detectable"] for row in analysis.differences.to_dict("records")):
+        sentences.append("Four times as many seeds would detect differences half as large.")
     return sentences
 
 
@@ -131,8 +133,8 @@ def notes(analysis: Analysis) -> list[str]:
         found.append(f"{', '.join(single)} {verb} a single run per game: no intervals, and another run may score differently.")
     if few := [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]:
         found.append(
-            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. Bootstrap intervals of so few runs are too narrow: "
-            "trust the conclusion above rather than intervals that do not overlap."
+            f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. Bootstrap intervals of so few runs are too narrow, so "
+            "intervals that do not overlap show nothing; the conclusion allows for it."
         )
     return found
 
@@ -142,7 +144,7 @@ def table_notes(analysis: Analysis) -> list[str]:
     comparison = analysis.comparison
     found = [
         "Raw scores: mean ± standard deviation over runs. Bold: significantly better than every other agent.",
-        "Below: aggregates of normalised scores over all runs and games, with 95% intervals; "
+        "The last rows are aggregates of normalised scores over all runs and games, with 95% intervals; "
         f"{comparison.above_one} are games with a mean above 1.",
     ]
     if len(analysis.means.columns):

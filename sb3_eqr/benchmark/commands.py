@@ -39,6 +39,10 @@ def check_resources(args: argparse.Namespace) -> str:
     return device
 
 
+def _command() -> str:
+    return shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
+
+
 def make_plan(args: argparse.Namespace) -> list[Run]:
     """
     :param args: arguments of ``run``
@@ -56,7 +60,8 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
     if args.steps is not None and args.steps < 1:
         raise ValueError(f"--steps must be >= 1, got {args.steps}.")
     suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
-    runs = plan_runs(args.folder, suite, args.agents, args.default_seeds if args.seeds is None else args.seeds)
+    n_seeds, command = args.default_seeds if args.seeds is None else args.seeds, _command()
+    runs = plan_runs(args.folder, suite, args.agents, n_seeds, command)
     write_plan(args.folder, suite, runs)
     return runs
 
@@ -68,10 +73,8 @@ def run(args: argparse.Namespace) -> int:
     runs = make_plan(args)
     for note in never_learn([planned.description() for planned in runs]):
         print(f"Note: {note}")
-    command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
     threads = max(int(args.cpus_per_run), 1)
     settings = Settings(
-        command=command,
         device=device,
         n_threads=threads,
         checkpoint_seconds=args.checkpoint_every,
@@ -111,8 +114,7 @@ def report(args: argparse.Namespace) -> int:
             raise ValueError(f"--reference must be NAME=FILE, got {text!r}.")
         references[name] = pathlib.Path(path)
     output = args.output or args.folders[0] / "report"
-    command = shlex.join(["sb3-eqr", "benchmark", *sys.argv[1:]])
-    path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, command)
+    path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, _command())
     print(f"Written: {path}")
     return 0
 
@@ -124,4 +126,4 @@ def execute(args: argparse.Namespace) -> None:
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:
-        fail("interrupted. The same command resumes from the last checkpoints.")
+        fail("interrupted. The same command continues: runs resume from their last checkpoint, or start again without one.")

@@ -162,7 +162,8 @@ def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[st
 def _read_suite(folder: pathlib.Path) -> Suite:
     path = pathlib.Path(folder) / "suite.yml"
     if not path.is_file():
-        raise ValueError(f"{folder} must be a folder of sb3-eqr benchmark run, got one without suite.yml.")
+        found = "one without suite.yml" if path.parent.is_dir() else "no folder"
+        raise ValueError(f"{folder} must be a folder of sb3-eqr benchmark run, got {found}. Run sb3-eqr benchmark run first.")
     return read_suite(path)
 
 

@@ -278,7 +278,8 @@ def learning_curves(comparison: Comparison) -> pd.DataFrame:
 def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
     """
     :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21, or the one of them that the agent has,
-        averaged over twentieths of the training; agents with neither are left out
+        averaged over twentieths of the training, interpolated where a run logged none, and left out before and after the
+        first and last of all its runs; agents with neither are left out
     """
     frames = []
     for run in comparison.results:
@@ -286,10 +287,14 @@ def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
         if len(rows) > 1:
             table = pd.DataFrame(rows).reindex(columns=["step", "aet_loss", "symmetry_loss"]).fillna(0.0)
             part = run["protocol"]["steps"] / N_LOSSES
-            ends = np.ceil(table["step"] / part) * part
-            means = (table["aet_loss"] + table["symmetry_loss"]).groupby(ends).mean()
-            frames.append(_rows(run, comparison, means.index.to_numpy(), means.to_numpy()))
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+            means = (table["aet_loss"] + table["symmetry_loss"]).groupby(np.ceil(table["step"] / part)).mean()
+            means = means.reindex(range(1, N_LOSSES + 1)).interpolate(limit_area="inside").dropna()
+            frames.append(_rows(run, comparison, means.index.to_numpy() * part, means.to_numpy()))
+    if not frames:
+        return pd.DataFrame()
+    found = pd.concat(frames, ignore_index=True)
+    runs = found.groupby(["game", "agent"])["seed"].transform("nunique")
+    return found[found.groupby(["game", "agent", "step"])["seed"].transform("nunique") == runs]
 
 
 def _rows(run: dict[str, Any], comparison: Comparison, steps: np.ndarray, values: np.ndarray) -> pd.DataFrame:
@@ -342,6 +347,7 @@ def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]
         for line, look in zip(ax.get_lines(), style.values(), strict=False):
             line.set_linestyle(look.line)
     grid.figure.set_layout_engine("constrained")
+    grid.set(xlim=(0, None))
     grid.set_titles("{col_name}").set_axis_labels("steps (thousands)", ylabel)
     _legend(grid.figure, style)
     return grid.figure

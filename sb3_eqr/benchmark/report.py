@@ -97,7 +97,8 @@ def _lead(comparison: Comparison) -> str:
     when = f"on {days[0]}" if days[0] == days[-1] else f"from {days[0]} to {days[-1]}"
     return (
         f"{counted(len(comparison.agents), 'agent')} on {counted(len(comparison.games), 'game')}, "
-        f"{per_game} of each per game, started {when}. Normalised scores: {comparison.unit} ({comparison.source})."
+        f"{per_game} of each per game, started {when}. Normalised scores: {comparison.unit} ({comparison.source}). "
+        "IQM: the mean of their middle half."
     )
 
 
@@ -163,6 +164,4 @@ def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
 
 def _commands(comparison: Comparison, command: str) -> list[str]:
     """:return: the commands that reproduce the runs and the report"""
-    commands = dict.fromkeys(result["command"] for result in comparison.results)
-    whole = [text for text in commands if "--suite" in text] or list(commands)  # leave out commands that only resumed runs
-    return [*whole, command]
+    return [*dict.fromkeys(result["command"] for result in comparison.results if result["command"]), command]

@@ -11,7 +11,7 @@ from sb3_eqr.benchmark.agents import Agent, find_agent, hyperparameters
 from sb3_eqr.benchmark.evaluation import check_game
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
-from sb3_eqr.common.checkpoints import find_checkpoints
+from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints
 from sb3_eqr.common.files import atomic_write
 
 SUITE = "suite.yml"  # in the folder of the benchmark
@@ -24,7 +24,6 @@ class Settings(Strict):
     """
     Settings that do not affect the scores.
 
-    :param command: command that reproduces the benchmark
     :param device: PyTorch device
     :param n_threads: number of PyTorch threads
     :param checkpoint_seconds: seconds between checkpoints
@@ -32,7 +31,6 @@ class Settings(Strict):
     :param save_models: whether to save trained agents in the format of RL Zoo
     """
 
-    command: str = ""
     device: str = "auto"
     n_threads: int = 1
     checkpoint_seconds: float = 300.0
@@ -64,6 +62,7 @@ class Run:
     :param seed: seed of agent, environments and evaluation
     :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
     :param entry: see :func:`~sb3_eqr.benchmark.agents.hyperparameters`
+    :param command: the command that planned the run, with its suite and agents
     """
 
     folder: pathlib.Path
@@ -73,6 +72,7 @@ class Run:
     seed: int
     protocol: dict[str, Any]
     entry: dict[str, Any]
+    command: str = ""
 
     @property
     def label(self) -> str:
@@ -88,6 +88,7 @@ class Run:
             "suite": self.suite,
             "protocol": self.protocol,
             "entry": {"algo": self.agent.algo, "file": str(self.agent.file), "hyperparameters": self.entry},
+            "command": self.command,
         }
 
     def state(self) -> State:
@@ -95,11 +96,13 @@ class Run:
         steps = self.protocol["steps"]
         if (self.folder / RESULT).is_file():
             return State("done", steps, 0.0)
-        found = self.folder / PROGRESS
-        progress = json.loads(found.read_text(encoding="utf-8")) if found.is_file() else {}
         if self.is_locked():
+            found = self.folder / PROGRESS
+            progress = json.loads(found.read_text(encoding="utf-8")) if found.is_file() else {}
             return State("running", progress.get("step", 0), progress.get("steps_per_second", 0.0))
-        return State("failed" if (self.folder / ERROR).is_file() else "waiting", progress.get("step", 0), 0.0)
+        kept = find_checkpoints(self.folder)  # from which it resumes
+        step = int(kept[-1].name.removeprefix(PREFIX)) if kept else 0
+        return State("failed" if (self.folder / ERROR).is_file() else "waiting", step, 0.0)
 
     def is_locked(self) -> bool:
         """:return: whether a process holds the run"""
@@ -123,7 +126,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
         file.write(to_json(value).encode())
 
 
-def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int) -> list[Run]:
+def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int, command: str = "") -> list[Run]:
     """
     Plan the runs of a benchmark, without writing anything. The seed is the outermost loop, so that an interrupted benchmark
     has complete tables of fewer seeds.
@@ -132,6 +135,7 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
     :param suite: the suite
     :param agents: agents as given by the user
     :param n_seeds: number of seeds, counted from 0
+    :param command: the command of the user
     :raises ValueError: for two agents of the same name, or for runs that exist with other settings
     """
     if n_seeds < 1:
@@ -148,7 +152,7 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
             entry = hyperparameters(agent, protocol, action_space)
             for seed in range(n_seeds):
                 place = folder / "runs" / agent.name.replace(":", "-") / game / str(seed)
-                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry))
+                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command))
     for run in runs:
         _check_plan(run)
     return sorted(runs, key=lambda run: run.seed)
@@ -201,8 +205,8 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
     for path in sorted(folder.glob(f"runs/*/*/*/{PLAN}"), key=lambda path: (int(path.parent.name), path)):
         plan = json.loads(path.read_text(encoding="utf-8"))
         agent = Agent(plan["agent"], plan["entry"]["algo"], pathlib.Path(plan["entry"]["file"]))
-        entry = plan["entry"]["hyperparameters"]
-        runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], plan["protocol"], entry))
+        settings = plan["protocol"], plan["entry"]["hyperparameters"], plan.get("command", "")
+        runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], *settings))
     if not runs:
         raise ValueError(
             f"{folder} must be the folder of a benchmark, got one without runs. Start a benchmark with "

@@ -83,7 +83,7 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
     try:
         content = RUNS.validate_json(pathlib.Path(path).read_bytes())
     except OSError as error:
-        raise ValueError(f"{expected}, got no readable file: {error}") from error
+        raise ValueError(f"{expected}, got no readable file: {error.strerror}.") from error
     except ValidationError as error:
         mistake = error.errors()[0]
         where = "".join(f"{place}: " for place in mistake["loc"])

@@ -219,11 +219,11 @@ def silence() -> Iterator[None]:
         yield
 
 
-def save_model(model: BaseAlgorithm, manager: ExperimentManager, settings: Settings, logs: pathlib.Path) -> None:
+def save_model(model: BaseAlgorithm, manager: ExperimentManager, run: Run, logs: pathlib.Path) -> None:
     """Save the agent in the folder of :func:`build` as ``sb3-eqr train`` does, without its log of episodes."""
     with silence():
         manager.save_trained_model(model)
-    pathlib.Path(manager.params_path, "command.txt").write_text(settings.command, encoding="utf-8")
+    pathlib.Path(manager.params_path, "command.txt").write_text(run.command, encoding="utf-8")
     for log in logs.rglob("*.monitor.csv"):
         log.unlink()
 
@@ -272,7 +272,6 @@ def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, 
         **run.description(),
         "versions": {"python": platform.python_version(), **versions},
         "machine": {"device": device, "threads": settings.n_threads, "platform": platform.platform(), "host": platform.node()},
-        "command": settings.command,
     }
 
 
@@ -312,7 +311,7 @@ def train(run: Run, settings: Settings) -> None:
         "steps_per_second": round(steps / max(record["training_seconds"], 1e-9), 2),
     }
     if settings.save_models:
-        save_model(model, manager, settings, logs)
+        save_model(model, manager, run, logs)
         shutil.rmtree(models, ignore_errors=True)
         logs.rename(models)
     write_json(run.folder / RESULT, {**provenance(run, model, settings), **times, **record})

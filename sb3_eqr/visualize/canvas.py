@@ -134,7 +134,7 @@ class Painter:
         size = 8 if len(self.panels) < 13 else 6
         ax.text(-0.94, 0.94, panel.name, color=GREY, fontsize=size, va="top")
         if panel.half_width is not None:
-            ax.text(0.94, -0.94, f"±{panel.half_width:.2g}", color=GREY, fontsize=size, ha="right")
+            ax.text(0.94, -0.94, f"edge ±{panel.half_width:.2g}", color=GREY, fontsize=size, ha="right")
         return ax
 
     def _legend(self, depth: int) -> None:
@@ -144,6 +144,10 @@ class Painter:
             Line2D([], [], color=NOW, markersize=4.5, label="now", **dot),
             Line2D([], [], color=PREDICTED, markersize=7, mfc="none", label=predicted, **dot),
         ]
+        if any(p.kind == "arrow" for p in self.panels):
+            handles.append(Line2D([], [], color=NOW, marker=r"$\rightarrow$", linestyle="", markersize=9, label="rotation"))
+        if any(p.truth.dots is not None for p in self.panels):
+            handles.append(Line2D([], [], color=NOW, alpha=0.35, label=f"last {TRAIL} steps"))
         if any(p.kind == "axes" for p in self.panels):
             handles += [Line2D([], [], color=color, label=name) for name, color in zip("xyz", AXES, strict=True)]
             handles.append(Line2D([], [], color=PREDICTED_AXES[0], label="pale: predicted"))

@@ -26,12 +26,13 @@ from sb3_eqr.visualize.measures import Rewards, Transition
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
-    "predicts": "The latent model predicts: {removed}. Nothing needs to be done.",
-    "does not predict": "The latent model does not predict: {removed}. Train longer, with prediction_depth and aet_coef above "
+    "predicts": "The latent model predicts: {errors}. Nothing needs to be done{unless}.",
+    "does not predict": "The latent model does not predict: {errors}. Train longer, with prediction_depth and aet_coef above "
     "0; if that does not help, transition.csv shows at which step it fails.",
-    "collapsed": "The latent states have collapsed to nearly a single one: {removed}. Keep reward_coef above 0, lower "
+    "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
 }
+UNLESS = ', unless you use the latent states themselves: then train with policy_kwargs=dict(projection="none")'
 COLLAPSED = 1e-3  # squared distance on the unit sphere: directions within two degrees of each other
 
 
@@ -54,14 +55,13 @@ class Diagnostics(NamedTuple):
     @property
     def summary(self) -> str:
         """The verdict in one sentence, and what to do in a second one."""
-        skill, gain = map(_share, skill_and_gain(self.loss))
-        latent_skill, latent_gain = map(_share, skill_and_gain(self.transition))
-        removed = (
-            f"over {len(self.loss.error)} steps it removes {skill} of the error of shuffled targets and {gain} of that of "
-            f"standing still, between the projections that the AET loss compares ({latent_skill} and {latent_gain} between "
-            "latent states)"
+        (skill, gain), (latent_skill, latent_gain) = skill_and_gain(self.loss), skill_and_gain(self.transition)
+        errors = (
+            f"over {len(self.loss.error)} steps, its error is {_lower(skill)} than with shuffled targets and {_lower(gain)} "
+            f"than when standing still ({_lower(latent_skill)} and {_lower(latent_gain)} between latent states, before the "
+            "projection)"
         )
-        return SENTENCES[self.verdict].format(removed=removed)
+        return SENTENCES[self.verdict].format(errors=errors, unless=UNLESS if latent_gain < PREDICTS else "")
 
 
 def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
@@ -133,5 +133,5 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> float:
     return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan
 
 
-def _share(value: float) -> str:
-    return "an unknown part" if np.isnan(value) else f"{value:.0%}" if value > 0 else "nothing"
+def _lower(share: float) -> str:
+    return "no lower" if np.isnan(share) else f"{share:.0%} lower" if share >= 0 else f"{-share:.0%} higher"

@@ -30,7 +30,8 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
     :raises ValueError: if the file does not exist or is not a saved agent
     """
     if not path.is_file():
-        raise ValueError(f"MODEL must be the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, got {str(path)!r}.")
+        example = "such as logs/eqr_qrdqn/ENV_1/ENV.zip"
+        raise ValueError(f"MODEL must be the path of a .zip file, {example}, got {str(path)!r}, which does not exist.")
     if not is_whole_model(path):
         raise ValueError(f"{path} must be a file written by an agent's save, got a truncated file or another kind of file.")
     try:

@@ -27,6 +27,7 @@ MAX_COORDINATES = 6  # of a block, in one panel
 MAX_NUMBERS = 36  # printed in a heat map
 MAX_NUMBER_COLUMNS = 6  # with more, the numbers would overlap
 PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # instead of powers of ten
+COORDINATES = {"angle": "angle in a plane (radians)", "a": "matrix entry a", "t": "translation t", "x": "entry x"}
 MAX_LETTERS = 72  # of horizontal tick labels at the bottom of a figure
 
 
@@ -64,7 +65,7 @@ def transition_figure(diagnostics: Diagnostics) -> Figure:
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     left.set_ylabel("mean squared distance")
-    figure.suptitle(f"Error of the predicted latent states: {diagnostics.verdict}", fontsize=10)
+    figure.suptitle(f"Errors of the prediction (verdict, from the right panel: {diagnostics.verdict})", fontsize=10)
     return figure
 
 
@@ -139,7 +140,8 @@ def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figur
         ax.set_xlabel("action")
         ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
     figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn) if len(drawn) < 5 else 3)
-    figure.supylabel("coordinate: radians, or latent units", fontsize=9)
+    kinds = {name.split(" ")[0] for part in diagnostics.generators for name in part.names}
+    figure.supylabel("coordinate: " + ", ".join(text for kind, text in COORDINATES.items() if kind in kinds), fontsize=9)
     part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks, those it moves most)"
     figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
     return figure

@@ -80,6 +80,10 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     assert read_suite(files / "b" / "suite.yml").games == ["CartPole", "Acrobot"]
     code, out = sb3_eqr("run b")  # no run is left
     assert code == 0 and "8 of 8 runs are already finished." in out.out
+    (files / "b/runs/dqn-fast/Acrobot/1/result.json").unlink()
+    assert sb3_eqr("run b")[0] == 0
+    result = json.loads((files / "b/runs/dqn-fast/Acrobot/1/result.json").read_text())
+    assert result["command"].startswith(f"sb3-eqr benchmark {line}")  # not the command that resumed it
 
 
 BROKEN = f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 4, max_grad_norm: wrong')}\n"

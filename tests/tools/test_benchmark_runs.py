@@ -50,10 +50,10 @@ def protocol(steps=STEPS, env_id="CartPole-v1", epsilon=0.0, n_envs=2, max_steps
     return {"env_id": env_id, "steps": steps, "preprocessing": {}, "evaluation": evaluation}
 
 
-def make_run(folder, algo, entry=None, game="CartPole-v1", **kwargs):
+def make_run(folder, algo, entry=None, game="CartPole-v1", command="", **kwargs):
     find_agent(algo)  # registers the agents of this package
     entry = yaml.safe_load(f"  {AGENTS[algo] if entry is None else entry}")
-    return Run(folder / "run", Agent(algo, algo, folder), "own", game, 3, protocol(env_id=game, **kwargs), entry)
+    return Run(folder / "run", Agent(algo, algo, folder), "own", game, 3, protocol(env_id=game, **kwargs), entry, command)
 
 
 def result_of(run):
@@ -116,8 +116,8 @@ def test_an_interrupted_run_has_the_scores_of_an_uninterrupted_one(algo, tmp_pat
 
 
 def test_the_contents_of_the_result(tmp_path):
-    run = make_run(tmp_path, "eqr_rainbow", points=4)
-    execute(run, Settings(command="sb3-eqr benchmark run x"))
+    run = make_run(tmp_path, "eqr_rainbow", points=4, command="sb3-eqr benchmark run x")
+    execute(run, Settings())
     result = result_of(run)
     assert [(row["step"], row["kind"], len(row["scores"])) for row in result["evaluations"]] == [
         (40, "curve", 3),
@@ -137,7 +137,7 @@ def test_the_contents_of_the_result(tmp_path):
 
 def test_saved_models_are_the_evaluated_agents_in_the_format_of_rl_zoo(tmp_path, monkeypatch):
     """With the normalisation of the observations; an interrupted run leaves no second copy."""
-    run, settings = make_run(tmp_path, "dqn"), Settings(command="made by", save_models=True)
+    run, settings = make_run(tmp_path, "dqn", command="made by"), Settings(save_models=True)
     stop_at(monkeypatch, STEPS // 2)
     with pytest.raises(KeyError):
         execute(run, settings)

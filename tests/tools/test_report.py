@@ -243,6 +243,7 @@ def test_differences_in_words(tmp_path):
     assert conclusion(analysis) == [
         "No agent is the best: the one with the highest IQM is not distinguished from all others.",
         *words,
+        "Four times as many seeds would detect differences half as large.",
     ]
 
 
@@ -305,7 +306,7 @@ def test_nothing_to_compare(tmp_path):
         compare([a_benchmark(tmp_path / "b", {"dqn": SCORES["dqn"]}, change=change)], {}, False)
     with pytest.raises(ValueError, match=r"c must contain finished runs, got none. Run sb3-eqr benchmark run first"):
         compare([a_benchmark(tmp_path / "c", {})], {}, False)
-    with pytest.raises(ValueError, match=r"nowhere must be a folder of sb3-eqr benchmark run, got one without suite.yml"):
+    with pytest.raises(ValueError, match=r"nowhere must be a folder of sb3-eqr benchmark run, got no folder. Run"):
         compare([tmp_path / "nowhere"], {}, False)
     with pytest.raises(ValueError, match="folders must be at least one benchmark folder, got none"):
         compare([], {}, False)
@@ -442,6 +443,19 @@ def test_curves_are_over_fractions_of_the_steps_and_end_with_the_final_evaluatio
     assert curves[0, 0, 0] == pytest.approx((-4.5 + 20.7) / 35.3)  # Pong, seed 0, half way
     losses = symmetry_losses(comparison).query("game == 'Pong'")
     assert losses["step"].tolist() == [5, 10] * 3 and (losses["value"] == 0.75).all()  # thousands: ends of twentieths
+
+
+def test_losses_between_those_logged_are_interpolated(tmp_path):
+    """Twentieths of 100,000 steps: seed 0 logs in the first and third, the other seeds from the second to the fourth."""
+
+    def change(result):
+        logged = {4_000: 1.0, 14_000: 3.0} if result["seed"] == 0 else {8_000: 5.0, 18_000: 7.0}
+        return result | {"losses": [{"step": step, "aet_loss": loss} for step, loss in logged.items()]}
+
+    folder = a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]}, change=change)
+    found = symmetry_losses(compare([folder], {}, False)).query("game == 'Pong'").groupby("seed")
+    assert found["step"].apply(list).tolist() == [[10, 15]] * 3
+    assert found["value"].apply(list).tolist() == [[2, 3], [5, 6], [5, 6]]
 
 
 def test_empty_figures_are_omitted(tmp_path):
