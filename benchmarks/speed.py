@@ -29,14 +29,13 @@ from torch.utils.benchmark import Timer, timer
 from benchmarks import workload
 from benchmarks.clock import Table, count_operations, median, take_turns
 from benchmarks.sizes import STORED, measure_sizes
-from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, bytes_per_transition, make_agent, make_trainable
+from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, bytes_per_transition, make_trainable
 from sb3_eqr.common.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others: they begin with the backup that is made every 50 updates
 N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
-NEIGHBOUR_ROUNDS, EVALUATION_ROUNDS = 8, 3  # maximum numbers, as these rounds are slow
-GAME, N_GAMES, ONE_BY_ONE, MAX_STEPS = "Pong", 100, 5, 1_000
+NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
 
 
@@ -154,32 +153,7 @@ def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
         yield Table(f"profile_{name}_{key}", f"Update of {name} by stage and operation, {key}", shown, notes)
 
 
-def measure_evaluation(args: argparse.Namespace) -> Iterator[Table]:
-    """The benchmark's evaluation compared with SB3's on one environment, including creation of the environments."""
-    from sb3_eqr.benchmark.evaluation import evaluate, play_environments
-    from sb3_eqr.benchmark.suites import load_suite
-    from sb3_eqr.envs import make_atari100k_env
-
-    protocol: dict[str, Any] = load_suite("atari100k").protocol(GAME)
-    protocol["evaluation"] |= {"max_steps": MAX_STEPS}
-    one: dict[str, Any] = {**protocol, "evaluation": {**protocol["evaluation"], "n_envs": 1}}
-    model = make_agent("EqRQRDQN", env=make_atari100k_env(GAME, seed=0))
-    ways = {
-        f"evaluate_policy, 1 environment, {ONE_BY_ONE} games": partial(play_environments, model, one, ONE_BY_ONE, 0),
-        f"benchmark's evaluate, {N_GAMES} games": partial(evaluate, model, protocol, N_GAMES, 0),
-    }
-    rates = np.zeros((min(args.rounds, EVALUATION_ROUNDS), len(ways)))  # steps per second
-    for rate in rates:
-        for place, play in enumerate(ways.values()):
-            start = timer()
-            _, lengths = play()
-            rate[place] = sum(lengths) / (timer() - start)
-    columns = {"steps_per_second": rates, "ratio": rates / rates[:, :1]}
-    rows = [{"name": way} | {key: median(found[:, i]) for key, found in columns.items()} for i, way in enumerate(ways)]
-    yield Table("evaluation", f"Evaluation, {GAME}, games of {MAX_STEPS} steps", rows)
-
-
-MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_evaluation, measure_sizes)
+MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_sizes)
 PARTS = {measure.__name__.removeprefix("measure_"): measure for measure in MEASURES}
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from rl_zoo3.utils import get_wrapper_class
@@ -19,12 +18,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_eqr.common.random_state import preserved_rng_state
-from sb3_eqr.envs.atari_batch import AtariBatch, has_atari_batch
 
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation shares no episodes with training, nor with another run's evaluation
-# The preprocessing that AtariBatch implements: the evaluation wrapper of the suite atari100k.
-WHOLE_ATARI_GAMES = {"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}], "frame_stack": 4}
-N_TURNS = 2  # batches: while the emulator steps one, the agent chooses actions for the other
 
 
 class EpsilonGreedy:
@@ -113,54 +108,6 @@ def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: in
     return VecFrameStack(env, n_stack) if n_stack else env
 
 
-class GamesInTurn:
-    """
-    A batch of Atari games and the agent that plays them, until every game has finished its share of episodes.
-
-    :param batch: batch of games
-    :param player: the agent
-    :param shares: number of episodes per game, (n_envs,)
-    """
-
-    def __init__(self, batch: AtariBatch, player: EpsilonGreedy, shares: np.ndarray):
-        self._batch = batch
-        self._player = player
-        self._left = shares.copy()
-        self._scores = np.zeros(batch.n_envs)
-        self._lengths = np.zeros(batch.n_envs, dtype=int)
-        self._observations = batch.reset()
-        self._starts = np.ones(batch.n_envs, dtype=bool)
-        self._state: tuple[np.ndarray, ...] | None = None
-
-    @property
-    def playing(self) -> bool:
-        """Whether any episodes are left."""
-        return bool(self._left.any())
-
-    def act(self) -> None:
-        """Choose actions and send them to the emulator, which runs while Python does other work."""
-        # No actions are computed for games that are done, except for a recurrent agent, whose states cover all games.
-        chosen = np.flatnonzero(self._left) if self._state is None else np.arange(self._batch.n_envs)
-        actions = np.zeros(self._batch.n_envs, dtype=int)
-        actions[chosen], self._state = self._player.predict(self._observations[chosen], self._state, self._starts[chosen])
-        self._batch.send(actions)
-
-    def see(self) -> list[tuple[float, int]]:
-        """
-        Wait for the emulator.
-
-        :return: score and length of each episode that has ended and counts
-        """
-        self._observations, rewards, self._starts = self._batch.receive()
-        self._scores += rewards
-        self._lengths += 1
-        counted = np.flatnonzero(self._starts & (self._left > 0))
-        ended = [(float(self._scores[i]), int(self._lengths[i])) for i in counted]
-        self._left[counted] -= 1
-        self._scores[self._starts], self._lengths[self._starts] = 0.0, 0
-        return ended
-
-
 def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
     """
     Scores and lengths of full episodes. Every environment plays a fixed share of them, so that short episodes are not
@@ -169,62 +116,13 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     :param n_episodes: number of episodes
     :param seed: seed of the run
     """
-    play, n_threads = play_environments, th.get_num_threads()
-    if fits_atari_batch(protocol, model):
-        play = play_atari
-        th.set_num_threads(max(n_threads // 2, 1))  # the emulator has threads of its own
-    try:
-        with preserved_rng_state(model.action_space):
-            scores, lengths = play(model, protocol, n_episodes, FIRST_SEED + SEEDS * seed)
-    finally:
-        th.set_num_threads(n_threads)
-    return [float(score) for score in scores], [int(length) for length in lengths]
-
-
-def play_environments(
-    model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int
-) -> tuple[list[float], list[int]]:
-    """:func:`evaluate` for any environments, stepped in turn in one process; ``seed`` is that of the first one."""
-    env = make_evaluation_env(protocol, model, seed)
-    try:
-        player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
-        scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)  # type: ignore[arg-type]
-    finally:
-        env.close()
+    seed = FIRST_SEED + SEEDS * seed
+    with preserved_rng_state(model.action_space):
+        env = make_evaluation_env(protocol, model, seed)
+        try:
+            player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
+            scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)  # type: ignore[arg-type]
+        finally:
+            env.close()
     assert isinstance(scores, list) and isinstance(lengths, list)
-    return scores, lengths
-
-
-def fits_atari_batch(protocol: dict[str, Any], model: BaseAlgorithm) -> bool:
-    """:return: whether ``AtariBatch`` implements the protocol for this agent"""
-    trained = model.get_vec_normalize_env()
-    return (
-        protocol["env_id"].endswith("NoFrameskip-v4")
-        and preprocessing_of(protocol) == WHOLE_ATARI_GAMES
-        and not (trained is not None and trained.norm_obs)
-        and has_atari_batch()
-    )
-
-
-def play_atari(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, seed: int) -> tuple[list[float], list[int]]:
-    """
-    :func:`evaluate` for Atari with the preprocessing :data:`WHOLE_ATARI_GAMES`, in two batches that take turns: while the
-    emulator steps one, the agent chooses actions for the other.
-    """
-    settings = protocol["evaluation"]
-    n_envs = min(settings["n_envs"], n_episodes)
-    shares = (n_episodes + np.arange(n_envs)) // n_envs
-    turns: list[GamesInTurn] = []
-    for indices in np.array_split(np.arange(n_envs), min(N_TURNS, n_envs)):
-        first = seed + int(indices[0])
-        batch = AtariBatch(protocol["env_id"], len(indices), first, settings["max_steps"])
-        turns.append(GamesInTurn(batch, EpsilonGreedy(model, settings["epsilon"], batch.action_space, first), shares[indices]))
-        turns[-1].act()
-    ended: list[tuple[float, int]] = []
-    while turns:
-        for games in turns:
-            ended += games.see()
-            if games.playing:
-                games.act()
-        turns = [games for games in turns if games.playing]
-    return [score for score, _ in ended], [length for _, length in ended]
+    return [float(score) for score in scores], [int(length) for length in lengths]

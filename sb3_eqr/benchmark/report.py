@@ -124,17 +124,11 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
     rows = []
     for agent in comparison.agents:
         runs = comparison.runs(agent)
-        rows.append(
-            [
-                comparison.label(agent),
-                all_of(sorted({run["seed"] for run in runs})),
-                all_of(f"{run['machine']['device']}, {run['machine'].get('platform', '')}" for run in runs),
-                all_of(run["machine"]["threads"] for run in runs),
-                number(comparison.minutes(agent)),
-                number(float(np.mean([run["steps_per_second"] for run in runs]))),
-                str(sum(bool(run["resumed_at"]) or run["attempts"] > 1 for run in runs)),
-            ]
-        )
+        seeds, threads = all_of(sorted({run["seed"] for run in runs})), all_of(run["machine"]["threads"] for run in runs)
+        device = all_of(f"{run['machine']['device']}, {run['machine'].get('platform', '')}" for run in runs)
+        speed = number(float(np.mean([run["steps_per_second"] for run in runs])))
+        restarted = str(sum(bool(run["resumed_at"]) or run["attempts"] > 1 for run in runs))
+        rows.append([comparison.label(agent), seeds, device, threads, number(comparison.minutes(agent)), speed, restarted])
     header = ["agent", "seeds", "device", "threads", "minutes per run", "steps/s", "restarted runs"]
     paths = {"Hyperparameters": ("entry", "hyperparameters"), "Protocol": ("protocol",), "Versions": ("versions",)}
     compared = [(heading, _html(_side_by_side(comparison, path), "words")) for heading, path in paths.items()]

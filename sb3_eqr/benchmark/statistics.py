@@ -115,11 +115,7 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
 
 def average_score_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """As :func:`performance_profile`, for the fraction of games whose mean over runs is above a threshold (Fig. 4 (b))."""
-
-    def fractions(scores: np.ndarray) -> np.ndarray:
-        return (scores.mean(axis=-2)[..., None] > thresholds).mean(axis=-2)
-
-    return estimate(fractions, matrix, reps=reps, seed=seed)
+    return estimate(lambda scores: (scores.mean(axis=-2)[..., None] > thresholds).mean(axis=-2), matrix, reps=reps, seed=seed)
 
 
 def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:

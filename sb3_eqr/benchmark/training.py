@@ -238,9 +238,9 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     """
     checkpoint, manifest = checkpoints.read_manifest(checkpoint)
     is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # SB3 does not save these
-    env = model.get_env()
-    assert env is not None
-    model = type(model).load(checkpoint / checkpoints.MODEL, env=env, device=model.device, force_reset=not is_exact)
+    model = type(model).load(
+        checkpoint / checkpoints.MODEL, env=model.get_env(), device=model.device, force_reset=not is_exact
+    )
     if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
         model.load_replay_buffer(checkpoint / checkpoints.BUFFER)
         buffer = model.replay_buffer

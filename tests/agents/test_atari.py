@@ -5,7 +5,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.atari_wrappers import NoopResetEnv
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -15,7 +14,6 @@ from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
-from sb3_eqr.envs.atari_batch import AtariBatch
 
 
 def games(env):
@@ -207,56 +205,3 @@ def test_the_wrapper_rejects_a_different_protocol():
         84,
         1,
     )
-
-
-@pytest.mark.parametrize(("game", "max_steps", "n_steps"), [("Breakout", None, 330), ("Pong", 70, 75), ("AirRaid", 60, 65)])
-def test_games_in_a_batch_equal_those_of_the_wrappers(monkeypatch, game, max_steps, n_steps):
-    """The same no-ops and actions give the same pixels, raw rewards and ends, across resets by ALE and by the step limit."""
-    if max_steps is not None:
-        monkeypatch.setattr(atari, "MAX_STEPS", max_steps)
-    batch = AtariBatch(game, 2, seed=3)
-    wrapped = make_atari100k_env(game, n_envs=2, seed=0, training=False)
-    starts = []
-    for env in games(wrapped):
-        while not isinstance(env, NoopResetEnv):
-            env = env.env
-        starts.append(env)
-    assert batch.action_space == wrapped.action_space
-    rng = np.random.default_rng(0)
-    obs = batch.reset()
-    for start, n_noops in zip(starts, batch.n_noops, strict=True):
-        start.override_num_noops = int(n_noops)
-    assert np.array_equal(obs, wrapped.reset())
-    n_ends, total = 0, 0.0
-    for _ in range(n_steps):
-        actions = rng.integers(0, batch.action_space.n, 2)
-        batch.send(actions)
-        obs, rewards, ends = batch.receive()
-        for start, n_noops in zip(starts, batch.n_noops, strict=True):
-            start.override_num_noops = int(n_noops)
-        expected, expected_rewards, expected_ends, _ = wrapped.step(actions)
-        assert np.array_equal(obs, expected) and np.array_equal(rewards, expected_rewards)
-        assert np.array_equal(ends, expected_ends)
-        n_ends, total = n_ends + ends.sum(), total + np.abs(rewards).sum()
-    assert n_ends >= 2 and total > 0
-
-
-def test_a_batch_starts_with_one_to_thirty_noops(monkeypatch):
-    monkeypatch.setattr(atari, "MAX_STEPS", 1)
-    batch = AtariBatch("Pong", 4, seed=0)
-    batch.reset()
-    drawn = [*batch.n_noops]
-    for _ in range(20):
-        batch.send(np.zeros(4, dtype=int))
-        assert batch.receive()[2].all()
-        drawn += [*batch.n_noops]
-    # 84 draws from 1 ... 30: all in range, extremes within 2 of the ends, the mean within two standard errors.
-    assert set(drawn) <= set(range(1, 31)) and min(drawn) <= 3 and max(drawn) >= 28
-    assert np.mean(drawn) == pytest.approx(15.5, abs=1.9)
-
-
-def test_the_seed_of_a_batch_is_the_seed_of_its_first_game():
-    first, second, third = (AtariBatch("Pong", n, seed=seed) for n, seed in ((3, 5), (2, 6), (2, 5)))
-    assert np.array_equal(first.reset()[1:], second.reset()) and np.array_equal(first.n_noops[1:], second.n_noops)
-    third.reset()
-    assert np.array_equal(first.n_noops[:2], third.n_noops) and not np.array_equal(first.n_noops[:2], second.n_noops)

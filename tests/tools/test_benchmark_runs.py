@@ -1,7 +1,6 @@
 """One run of a benchmark: its protocol, its checkpoints and its files."""
 
 import json
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -13,15 +12,15 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr.benchmark import evaluation, training
+from sb3_eqr.benchmark import training
 from sb3_eqr.benchmark.agents import Agent, find_agent
-from sb3_eqr.benchmark.evaluation import EpsilonGreedy, GamesInTurn, evaluate, fits_atari_batch, make_evaluation_env
+from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
 from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.common.env_state import capture, restore
-from sb3_eqr.envs import atari, atari_batch, make_atari100k_env
+from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 
 STEPS = 160
@@ -306,11 +305,11 @@ class Watching(Fixed):
         return super().predict(observation, state, episode_start, deterministic)
 
 
-def test_no_actions_are_computed_for_atari_games_that_are_done():
-    """Random play of Breakout lasts about 120 to 300 steps; the agent is called once for each counted step."""
-    agent, state = Watching(), np.random.get_state()[1].copy()
-    scores, lengths = evaluate(agent, atari_protocol("Breakout", epsilon=1.0), 3, seed=0)
-    assert len(scores) == len(lengths) == 3 and len(agent.seen) == sum(lengths) and len(set(lengths)) > 1
+def test_scores_and_lengths_of_atari_are_those_of_full_games():
+    """Random play of Breakout lasts about 120 to 300 steps."""
+    state = np.random.get_state()[1].copy()
+    scores, lengths = evaluate(Fixed(), atari_protocol("Breakout", epsilon=1.0), 3, seed=0)
+    assert len(scores) == len(lengths) == 3 and len(set(lengths)) > 1
     assert all(100 < length < 500 for length in lengths) and 0 < sum(scores) < 50
     assert (np.random.get_state()[1] == state).all()
 
@@ -320,83 +319,6 @@ def test_the_seed_determines_the_atari_games_that_are_played():
     for agent, seed in zip(agents, (0, 0, 1), strict=True):
         evaluate(agent, atari_protocol("Breakout", n_envs=1, epsilon=1.0, max_steps=15), 1, seed=seed)
     assert agents[0].seen == agents[1].seen != agents[2].seen
-
-
-class Scripted:
-    """A batch of games of given lengths, repeated; every step scores 1 in the first game, 10 in the second, ..."""
-
-    def __init__(self, lengths):
-        self.lengths, self.n_envs = np.array(lengths), len(lengths)
-        self.sent = []
-
-    def reset(self):
-        self.step = 0
-        return np.zeros((self.n_envs, 1))
-
-    def send(self, actions):
-        self.sent.append(actions)
-
-    def receive(self):
-        self.step += 1
-        return np.full((self.n_envs, 1), self.step), 10.0 ** np.arange(self.n_envs), self.step % self.lengths == 0
-
-
-class Recurrent(Fixed):
-    """An agent whose state is the number of steps in the episode of each game; its action is 7."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        count = np.zeros(len(observation)) if state is None else state[0]
-        self.count = np.where(episode_start, 0, count) + 1
-        return np.full(len(observation), 7), (self.count,)
-
-
-def play_scripted(agent, shares):
-    batch = Scripted([2, 3, 6])
-    games = GamesInTurn(batch, EpsilonGreedy(agent, 0.0, Corridor.action_space, 0), np.array(shares))
-    ended = []
-    while games.playing:
-        games.act()
-        ended += games.see()
-    return batch, ended
-
-
-def test_each_game_of_a_batch_plays_its_share():
-    batch, ended = play_scripted(Fixed(), [4, 1, 2])
-    assert ended == [(2.0, 2), (30.0, 3), (2.0, 2), (2.0, 2), (600.0, 6), (2.0, 2), (600.0, 6)]
-    assert len(batch.sent) == 12
-    assert play_scripted(Fixed(), [1, 0, 0])[1] == [(2.0, 2)]
-
-
-def test_a_recurrent_agent_keeps_a_state_for_each_game_of_a_batch():
-    agent = Recurrent()
-    batch, ended = play_scripted(agent, [1, 1, 2])
-    assert ended == [(2.0, 2), (30.0, 3), (600.0, 6), (600.0, 6)]
-    assert all(actions.tolist() == [7, 7, 7] for actions in batch.sent)
-    assert agent.count.tolist() == [2, 3, 6]  # at the twelfth step
-
-
-def test_protocols_that_an_atari_batch_supports(monkeypatch):
-    fitting = atari_protocol("Breakout")
-    assert fits_atari_batch(fitting, Fixed())
-    assert not fits_atari_batch(protocol(), Fixed())
-    assert not fits_atari_batch(fitting | {"env_id": "ALE/Breakout-v5"}, Fixed())  # has frame skip and sticky actions
-    assert not fits_atari_batch(fitting | {"preprocessing": {"env_kwargs": {"full_action_space": True}}}, Fixed())
-    other = fitting["evaluation"] | {"preprocessing": {"env_wrapper": "my.Wrapper", "frame_stack": 4}}
-    assert not fits_atari_batch(fitting | {"evaluation": other}, Fixed())
-    normalised = Fixed()
-    normalised.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=True)
-    assert not fits_atari_batch(fitting, normalised)
-    normalised.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=False)
-    assert fits_atari_batch(fitting, normalised)
-    monkeypatch.setattr(atari_batch, "version", lambda name: "0.11.2")
-    assert not fits_atari_batch(fitting, Fixed())
-
-
-def test_atari_is_evaluated_without_a_batch_if_ale_has_none(monkeypatch):
-    monkeypatch.setattr(atari, "MAX_STEPS", 40)
-    monkeypatch.setattr(evaluation, "has_atari_batch", lambda: False)
-    monkeypatch.setattr(evaluation, "AtariBatch", None)
-    assert evaluate(Fixed(), atari_protocol("Breakout"), 4, seed=0)[1] == [40] * 4
 
 
 def test_atari_games_are_saved_in_the_middle():

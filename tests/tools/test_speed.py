@@ -94,7 +94,7 @@ def test_a_table():
 
 def test_options():
     args = speed.parse([])
-    assert args.only == ["updates", "neighbour", "steps", "profile", "evaluation"] and args.network is None
+    assert args.only == ["updates", "neighbour", "steps", "profile"] and args.network is None
     args = speed.parse(["--only", "sizes,steps", "--network", "minatar,cartpole", "--before", str(ROOT)])
     assert args.only == ["sizes", "steps"] and args.network == ["minatar", "cartpole"]
 
@@ -102,7 +102,7 @@ def test_options():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, evaluation, sizes, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, sizes, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
         ("--largest 100", "--largest must be an integer >= 10000, got 100"),
@@ -149,11 +149,7 @@ def test_script_prints_its_tables(tmp_path):
 
 
 @pytest.mark.slow
-def test_evaluation_and_sizes(monkeypatch):
-    """With a few short games and small buffers."""
-    for name, value in {"N_GAMES": 2, "ONE_BY_ONE": 1, "MAX_STEPS": 20}.items():
-        monkeypatch.setattr(speed, name, value)
+def test_sizes():
+    """With small buffers."""
     args = argparse.Namespace(rounds=1, largest=10_000, threads=1)
-    (table,) = speed.measure_evaluation(args)
-    assert len(table.rows) == 2 and all(row["steps_per_second"] > 0 for row in table.rows)
     assert [table.name for table in speed.measure_sizes(args)] == ["stored_transitions", "n_envs", "M", "K", "group"]
