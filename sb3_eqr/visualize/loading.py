@@ -140,6 +140,7 @@ def zoo_arguments(folder: pathlib.Path) -> dict[str, Any]:
 
 def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: int, render: bool) -> VecEnv:
     try:
+        import rl_zoo3.import_envs  # noqa: F401 - registers Atari and others
         from rl_zoo3.utils import create_test_env, get_saved_hyperparams
     except ImportError as error:
         advice = 'Run pip install ".[zoo]" in a clone of the repository.'

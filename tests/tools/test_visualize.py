@@ -261,7 +261,8 @@ def test_command_line(trained, sb3_eqr, tmp_path):
         assert Image.open(tmp_path / "out" / f"{name}.png").size == (900, 600)
 
 
-def test_rl_zoos_files_next_to_the_model_are_used(tmp_path):
+def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "rl_zoo3.import_envs", raising=False)
     folder = tmp_path / "Ring-v0_1" / "Ring-v0"
     folder.mkdir(parents=True)
     env = VecNormalize(make_vec_env(functools.partial(Ring, keys=False)))
@@ -275,6 +276,7 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path):
     loaded = loading.load_model(path, device="cpu")
     assert type(loaded) is EqRQRDQN
     found = loading.make_env(loaded, path)
+    assert "rl_zoo3.import_envs" in sys.modules  # in a new process, nothing else registers Atari
     assert isinstance(found, VecNormalize) and found.obs_rms.mean[0] == 7 and not found.training and not found.norm_reward
     seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
     assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
