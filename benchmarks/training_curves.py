@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from sb3_eqr.benchmark.scores import load_results
 from sb3_eqr.common.files import atomic_write
-from sb3_eqr.plot_style import looks, settings
+from sb3_eqr.plot_style import looks, styled
 
 POINTS = 50  # of a curve: means over parts of equal length
 PANELS = {  # title -> column
@@ -107,7 +107,7 @@ def main() -> None:
     if not results:
         raise SystemExit(f"{arguments.folder} must be the folder of a benchmark, got one without finished runs.")
     for game in dict.fromkeys(result["game"] for result in results):
-        with settings():
+        with styled():
             figure = figure_of([result for result in results if result["game"] == game])
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})

@@ -49,7 +49,7 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
 
 
 @contextmanager
-def settings() -> Iterator[None]:
+def styled() -> Iterator[None]:
     """Apply Matplotlib's settings for these plots, and restore the previous ones afterwards."""
     with matplotlib.rc_context(SETTINGS):
         yield

@@ -22,7 +22,7 @@ from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import SHOWN, SHOWN_GROUPS, SHOWN_LOSSES, PublishedMethod
 from sb3_eqr.benchmark.scores import evaluation_curve
 from sb3_eqr.benchmark.tables import aggregate_means
-from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, settings
+from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
 
 DPI = 160
 N_THRESHOLDS = 81  # points of a performance profile
@@ -64,7 +64,7 @@ def to_png(shown: ReportFigure) -> bytes:
     file = io.BytesIO()
     for ax in shown.figure.axes:
         ax.spines[:].set_linewidth(SETTINGS["axes.linewidth"])  # rliable draws thick ones
-    with settings():
+    with styled():
         shown.figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", metadata={"Software": None})
     plt.close(shown.figure)
     return file.getvalue()
@@ -74,7 +74,7 @@ def all_figures(analysis: Analysis) -> list[ReportFigure]:
     """:return: the figures for which there is data"""
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
     best = "Higher is better for IQM, median and mean, lower for the optimality gap; as Figure 5 (a) of the EqR paper."
-    with settings():
+    with styled():
         return [
             _profiles(analysis, style),
             _intervals(analysis, style, "aggregates", "Aggregate scores", list(analysis.matrices), SHOWN, best),

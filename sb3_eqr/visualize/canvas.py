@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sb3_eqr.plot_style import GREY, INK, settings
+from sb3_eqr.plot_style import GREY, INK, styled
 from sb3_eqr.visualize.sketches import ROOM, Panel, Shape
 
 WIDTH, HEIGHT = 900, 500  # pixels; even, as H.264 requires
@@ -98,7 +98,7 @@ class Painter:
         n = len(panels)
         columns = max(range(1, n + 1), key=lambda columns: min(1.3 / columns, 1 / -(-n // columns)))  # the largest squares
         rows = -(-n // columns)
-        with settings():
+        with styled():
             self.figure = Figure((WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
             self.canvas = FigureCanvasAgg(self.figure)
             self.game = self.figure.add_axes((0.01, 0.08, 0.37, 0.84))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SO, Group
-from sb3_eqr.plot_style import GREY, settings
+from sb3_eqr.plot_style import GREY, styled
 from sb3_eqr.visualize.latents import frame, split
 from sb3_eqr.visualize.measures import ROUNDING
 
@@ -43,9 +43,9 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
     spreads = np.array([float(found.flatten(1).double().std(dim=0, correction=0).norm()) for _, _, found in blocks])
     shown = sorted(np.argsort(-spreads, kind="stable")[:MAX_PANELS])
     cyclic = label.split(" ")[0] in CYCLIC
-    with settings():
+    with styled():
         figure = Figure(figsize=SIZE)  # a constrained layout would take longer than the drawing itself
-        axes = panels(figure, len(shown))
+        axes = make_axes(figure, len(shown))
         for ax, i in zip(axes, shown, strict=True):
             group, name, found = blocks[i]
             constant = spreads[i] <= ROUNDING * float(found.norm()) / len(found) ** 0.5
@@ -67,7 +67,7 @@ def n_columns(count: int) -> int:
     return 4 if count > 4 else min(count, 2)
 
 
-def panels(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
+def make_axes(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
     """:return: ``count`` axes, in rows of at most four"""
     columns = n_columns(count)
     rows = -(-count // columns)

@@ -14,9 +14,9 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sb3_eqr.common.files import atomic_write
-from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, settings
+from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, styled
 from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
-from sb3_eqr.visualize.latent_figure import MAX_PANELS, SIZE, latent_figure, n_columns, panels
+from sb3_eqr.visualize.latent_figure import MAX_PANELS, SIZE, latent_figure, make_axes, n_columns
 from sb3_eqr.visualize.measures import ROUNDING, Transition
 from sb3_eqr.visualize.tables import factor_names
 
@@ -38,7 +38,7 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
     :param factors: names of the true factors, (F,), if known
     :return: name of the file without suffix -> figure
     """
-    with settings():
+    with styled():
         return {
             "transition": transition_figure(diagnostics),
             "motion": motion_figure(diagnostics, actions),
@@ -52,7 +52,7 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
 def write_pictures(figures: dict[str, Figure], folder: pathlib.Path) -> None:
     """Write each figure as PNG, to a temporary file that is renamed."""
     for name, figure in figures.items():
-        with atomic_write(folder / f"{name}.png", "png") as file, settings():
+        with atomic_write(folder / f"{name}.png", "png") as file, styled():
             figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
 
 
@@ -127,7 +127,7 @@ def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figur
     shown = sorted(np.argsort(-motion, kind="stable")[:MAX_PANELS])
     places = [(part, k) for part in diagnostics.generators for k in range(part.mean.shape[1])]
     figure = Figure(figsize=SIZE, layout="constrained")
-    axes = panels(figure, len(shown), sharey=True)
+    axes = make_axes(figure, len(shown), sharey=True)
     drawn: dict[str, Any] = {}
     for ax, block in zip(axes, shown, strict=True):
         part, k = places[block]
