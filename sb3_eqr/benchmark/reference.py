@@ -34,6 +34,7 @@ SHOWN = (
     PublishedMethod("DER (rliable, 100 runs)", "DER", 100),
     PublishedMethod("DrQ (rliable, 100 runs)", "DrQ", 100),
     PublishedMethod("SPR (rliable, 100 runs)", "SPR", 100),
+    PublishedMethod("SPR+resets (Nikishin et al., 32 runs, final eval, back-computed from HNS)", "SPR with resets", 32),
     PublishedMethod("BBF RR8_BBF", "BBF, replay ratio 8", 52, 60),
 )
 SHOWN_LOSSES = SHOWN[:4]  # Table 4
