@@ -195,6 +195,16 @@ def test_the_logits_of_a_new_agent_depend_on_the_frames(configuration, low, high
     assert low <= found["logits_over_states"] / found["logits_over_noise"] <= high
 
 
+def test_the_trunk_does_not_grow_in_the_first_updates():
+    """If the gradient of a constant reached the trunk, its features would be 80 times as large after 100 updates on Boxing."""
+    settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0}
+    model = EqRRainbow("CnnPolicy", make_atari100k_env("Boxing", seed=0), **settings).learn(200)
+    trunk, frames = model.policy.online.features_extractor.trunk, model.replay_buffer.sample(64).observations / 255
+    before = trunk(frames).max().item()
+    model.train(100, 16)
+    assert trunk(frames).max().item() < 5 * before
+
+
 def test_frames_stay_different_in_the_first_updates():
     """Without centring, the TD loss makes the features of all frames of Pong alike within 100 updates."""
     spreads = {}

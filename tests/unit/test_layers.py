@@ -180,12 +180,16 @@ def test_the_running_mean_by_hand():
     np.testing.assert_allclose(layer.running_mean, expected, atol=1e-12)
 
 
-def test_no_gradient_flows_through_the_mean():
+def test_the_gradient_has_no_mean_over_the_batch():
+    """As if the mean of the batch were subtracted: a loss must not ask for a constant that the running mean then removes."""
     layer, features = Centering(3), th.randn(5, 3, requires_grad=True)
-    layer(features)
+    weights = th.randn(5, 3)
+    layer(features).backward(weights)
+    np.testing.assert_allclose(features.grad, weights - weights.mean(dim=0), atol=1e-6)
+    (of_batch,) = th.autograd.grad((features - features.mean(dim=0)).mul(weights).sum(), features)
+    np.testing.assert_allclose(features.grad, of_batch, atol=1e-6)
     layer.update()
-    layer(features).sum().backward()
-    assert th.equal(features.grad, th.ones(5, 3)) and not layer.running_mean.requires_grad
+    assert not layer.running_mean.requires_grad
 
 
 def test_layers_print_their_sizes():

@@ -221,7 +221,9 @@ class Centering(nn.Module):
         :return: (B, D)
         """
         if self.training and th.is_grad_enabled():
-            self.batch_mean.copy_(features.detach().mean(dim=0))
+            mean = features.mean(dim=0)
+            self.batch_mean.copy_(mean.detach())
+            features = features - (mean - mean.detach())  # no change of the values, but of their gradient
         return features - self.running_mean
 
     def update(self) -> None:
