@@ -1,12 +1,13 @@
 """
 How much the latent state x₀ varies at initialisation and later, and which gradients reach it in the first updates.
 
-    python -m benchmarks.state_signal --games Krull Pong MsPacman --json docs/results/state_signal.json
+    python -m benchmarks.state_signal --games Krull Pong MsPacman Boxing --json docs/results/state_signal.json
 
 Spread over states: the root mean square distance from the mean state. Logits: the standard deviation over states without
 noise, and over samples of the head's noise at one state, each as root mean square over atoms and actions. Gradients: their
 norms where the losses meet, medians over the updates (train/td_state_gradient, train/aux_state_gradient). Later, after
-``--later`` updates: the spread over the constant part, and the skill of the predictions one and five steps ahead.
+``--later`` updates: the spread over the constant part, the skill of the predictions one and five steps ahead, the share of
+the trunk's features that are the same for all frames, and the largest feature, compared with that at initialisation.
 """
 
 import argparse
@@ -18,6 +19,8 @@ import numpy as np
 import torch as th
 
 from sb3_eqr import EqRRainbow, envs
+from sb3_eqr.common.networks.encoders import ConvExtractor
+from sb3_eqr.common.networks.layers import Centering
 from sb3_eqr.common.objective import LossCoefs
 from sb3_eqr.configurations import load_configuration
 from sb3_eqr.visualize.diagnostics import diagnose
@@ -27,6 +30,7 @@ N_DRAWS = 32  # samples of noise
 N_WINDOWS = 512  # for the skill
 CHANGES: dict[str, dict[str, Any]] = {  # name -> arguments that differ from those of EqRRainbow("CnnPolicy", env)
     "default": {},
+    "constant_gradient": {},  # the gradient of what all frames have in common reaches the trunk
     "no_centring": {"policy_kwargs": {"center": False}},
     "random_actions": {},  # κ and ρ start with PyTorch's initial weights
     "neither": {"policy_kwargs": {"center": False}},  # no centring, random actions
@@ -84,10 +88,28 @@ def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
 def later(model: EqRRainbow) -> dict[str, float]:
     """
     :param model: an agent after some updates
-    :return: spread of the latent states over their size, skill one and M steps ahead
+    :return: spread of the latent states over their size, skill one and M steps ahead, share of constant features
     """
     found = diagnose(model, replayed(model, N_WINDOWS, np.random.default_rng(0)))
-    return {"relative_spread": found.collapse.spread, "skill_1": found.loss.skill[0], "skill_5": found.loss.skill[-1]}
+    skill = {"skill_1": found.loss.skill[0], "skill_5": found.loss.skill[-1]}
+    return {"relative_spread": found.collapse.spread, **skill, "dead_units": found.collapse.dead_units}
+
+
+@th.no_grad()
+def largest_feature(model: EqRRainbow, observations: np.ndarray) -> float:
+    """The largest output of the last ReLU for observations, (N, *obs_shape)."""
+    trunk: Any = model.policy.online.features_extractor
+    while not isinstance(trunk, ConvExtractor):
+        trunk = trunk.trunk
+    return trunk(model.policy.obs_to_tensor(observations)[0] / 255).max().item()
+
+
+def keep_constant_gradient(model: EqRRainbow) -> None:
+    """Let the gradient of what all frames have in common reach the trunk, where the running mean removes the effect again."""
+    for layer in model.policy.online.modules():
+        if isinstance(layer, Centering):
+            centred = layer.forward
+            layer.forward = lambda features, centred=centred: centred(features.detach()) + features - features.detach()
 
 
 def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frames: int) -> dict[str, Any]:
@@ -106,22 +128,25 @@ def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frame
         networks: tuple[Any, ...] = model.policy.latent_model.transition, model.policy.latent_model.action_symmetry
         for *_, last in networks:
             last.reset_parameters()
+    if configuration == "constant_gradient":
+        keep_constant_gradient(model)
     model.learn(n_frames)
     assert model.replay_buffer is not None
     observations = model.replay_buffer.sample(256).observations
+    before = largest_feature(model, observations.numpy())
     found = signal(model, observations.numpy())  # type: ignore[union-attr]
     if model.depth:
         found |= gradients(model, n_updates)
     if n_later > n_updates:
         model.train(n_later - n_updates, model.batch_size)
-        found |= later(model)
+        found |= later(model) | {"growth": largest_feature(model, observations.numpy()) / before}
     return {"game": game, "configuration": configuration, **{key: float(f"{value:.4g}") for key, value in found.items()}}
 
 
 def main() -> None:
     """Parse the command line, measure, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--games", nargs="+", default=["Krull", "Pong", "MsPacman"])
+    parser.add_argument("--games", nargs="+", default=["Krull", "Pong", "MsPacman", "Boxing"])
     parser.add_argument("--configurations", nargs="+", default=["paper", *CHANGES])
     parser.add_argument("--updates", type=int, default=90, help="for the gradients")
     parser.add_argument("--later", type=int, default=500, help="updates before spread and skill are measured; 0: not")

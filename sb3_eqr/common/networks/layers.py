@@ -195,9 +195,13 @@ class DistributionalHead(nn.Module):
 
 class Centering(nn.Module):
     """
-    Subtract the running mean of the features, the part that is the same for all observations. No gradient flows through it.
-    A call in train mode that records gradients notes the mean of its batch, and :meth:`update` moves the running mean towards
-    that one, so all calls of the same update subtract the same mean.
+    Subtract the running mean of the features, the part that is the same for all observations. A call in train mode that
+    records gradients notes the mean of its batch, and :meth:`update` moves the running mean towards that one, so all calls of
+    the same update subtract the same mean.
+
+    The gradient is centred as well, as if the mean of the batch were subtracted. Otherwise the loss would ask, at each
+    update, for a constant that the running mean then removes, and the features would grow without bound (Ioffe and Szegedy
+    2015, section 2, https://arxiv.org/abs/1502.03167). So a batch needs two observations to train what is before this layer.
 
     After n batches, the weight of a new one is 1 / (1 + 0.03 n), at least 0.01: the first updates change the mean fast, and a
     mean that lags behind would leave what it is to remove (docs/gradients.md); later, more batches make it more precise.
@@ -223,7 +227,7 @@ class Centering(nn.Module):
         if self.training and th.is_grad_enabled():
             mean = features.mean(dim=0)
             self.batch_mean.copy_(mean.detach())
-            features = features - (mean - mean.detach())  # no change of the values, but of their gradient
+            features = features - (mean - mean.detach())  # subtracts 0; the gradient loses its mean
         return features - self.running_mean
 
     def update(self) -> None:
