@@ -13,6 +13,7 @@ the trunk's features that are the same for all frames, and the largest feature, 
 import argparse
 import json
 import pathlib
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,15 +102,20 @@ def largest_feature(model: EqRRainbow, observations: np.ndarray) -> float:
     trunk: Any = model.policy.online.features_extractor
     while not isinstance(trunk, ConvExtractor):
         trunk = trunk.trunk
-    return trunk(model.policy.obs_to_tensor(observations)[0] / 255).max().item()
+    return trunk(th.as_tensor(observations) / 255).max().item()
 
 
 def keep_constant_gradient(model: EqRRainbow) -> None:
     """Let the gradient of what all frames have in common reach the trunk, where the running mean removes the effect again."""
+
+    def forward(layer: Centering, features: th.Tensor) -> th.Tensor:
+        if layer.training and th.is_grad_enabled():
+            layer.batch_mean.copy_(features.detach().mean(dim=0))
+        return features - layer.running_mean
+
     for layer in model.policy.online.modules():
         if isinstance(layer, Centering):
-            centred = layer.forward
-            layer.forward = lambda features, centred=centred: centred(features.detach()) + features - features.detach()
+            layer.forward = partial(forward, layer)  # type: ignore[method-assign]
 
 
 def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frames: int) -> dict[str, Any]:
@@ -132,14 +138,14 @@ def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frame
         keep_constant_gradient(model)
     model.learn(n_frames)
     assert model.replay_buffer is not None
-    observations = model.replay_buffer.sample(256).observations
-    before = largest_feature(model, observations.numpy())
-    found = signal(model, observations.numpy())  # type: ignore[union-attr]
+    observations = model.replay_buffer.sample(256).observations.numpy()  # type: ignore[union-attr]
+    before = largest_feature(model, observations)
+    found = signal(model, observations)
     if model.depth:
         found |= gradients(model, n_updates)
     if n_later > n_updates:
         model.train(n_later - n_updates, model.batch_size)
-        found |= later(model) | {"growth": largest_feature(model, observations.numpy()) / before}
+        found |= later(model) | {"growth": largest_feature(model, observations) / before}
     return {"game": game, "configuration": configuration, **{key: float(f"{value:.4g}") for key, value in found.items()}}
 
 
