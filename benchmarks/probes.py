@@ -6,6 +6,7 @@ from MinAtar's planes, and for Atari from the console's memory.
     python -m benchmarks.probes --game Breakout --steps 10000 --seeds 0 1
     python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
     python -m benchmarks.probes --game ALE/Pong --steps 0
+    python -m benchmarks.probes --game ALE/Boxing --models runs/atari/runs/*/Boxing/0/models/*/*/*.zip
 """
 
 import argparse
@@ -66,10 +67,11 @@ def explained(inputs: np.ndarray, target: np.ndarray) -> float:
     return float(1 - left.var() / max(y[cut:].var(), 1e-9))
 
 
-def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-    """
-    :return: what is probed -> object -> R², on frames of the agent's own episodes, with about a third of its actions random
-    """
+Frames = tuple[np.ndarray, dict[str, np.ndarray]]  # observations, and object -> position, in random order
+
+
+def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
+    """Frames of the agent's own episodes, with about a third of its actions random; (N, *obs_shape) and (N,)."""
     obs, frames, memory = env.reset(), [], []
     for _ in range(N_FRAMES):
         frames.append(obs[0].copy())
@@ -80,14 +82,42 @@ def probe(model: Any, env: Any, game: str, rng: np.random.Generator) -> dict[str
         obs, *_ = env.step(action)
     seen = np.stack(frames)
     order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
-    with th.no_grad():
-        features = np.concatenate([model.policy.online.features(part).numpy() for part in th.as_tensor(seen).split(250)])
-    inputs = {"trunk": features, "state": encode(model, th.as_tensor(seen)).cpu().numpy()}
     if game in MEMORY:
         known = {name: np.stack(memory)[:, address].astype(float) for name, address in MEMORY[game].items()}
     else:
         known = targets(seen, PLANES[game])
-    return {what: {name: explained(x[order], y[order]) for name, y in known.items()} for what, x in inputs.items()}
+    return seen[order], {name: positions[order] for name, positions in known.items()}
+
+
+def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
+    """
+    :return: what is probed -> object -> R²; the latent state only for agents with a group
+    """
+    seen, known = frames
+    with th.no_grad():
+        features = np.concatenate([model.policy.online.features(part).numpy() for part in th.as_tensor(seen).split(250)])
+    inputs = {"trunk": features}
+    if model.policy.latent_model is not None:
+        inputs["state"] = encode(model, th.as_tensor(seen)).cpu().numpy()
+    return {what: {name: explained(x, y) for name, y in known.items()} for what, x in inputs.items()}
+
+
+def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
+    """Print R² as a Markdown table: a row per object, a column per agent and what is probed."""
+    columns = [(agent, what) for agent in found for what in found[agent]]
+    print(f"| {title} | {' | '.join(f'{agent}, {what}' for agent, what in columns)} |")
+    print("|---|" + "---|" * len(columns))
+    for name in found[columns[0][0]]["trunk"]:
+        print(f"| {name} | " + " | ".join(f"{found[agent][what].get(name, np.nan):.2f}" for agent, what in columns) + " |")
+
+
+def probe_saved(game: str, paths: list[str]) -> None:
+    """Probe saved agents, and an untrained one, on the same frames: those of the first agent's episodes."""
+    env: Any = envs.make_atari100k_env(game.removeprefix("ALE/"), n_envs=1, seed=0)
+    models = {path: EqRRainbow.load(path, env, device="cpu", custom_objects={"buffer_size": 100}) for path in paths}
+    frames = watch(models[paths[0]], models[paths[0]].get_env(), game, np.random.default_rng(0))
+    models["untrained"] = EqRRainbow("CnnPolicy", env, seed=0, device="cpu", buffer_size=100)
+    print_table("R²", {name: probe(model, frames) for name, model in models.items()})
 
 
 def main() -> None:
@@ -98,9 +128,13 @@ def main() -> None:
     parser.add_argument("--changes", type=yaml.safe_load, default={}, help="changes of its entry, as YAML")
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--models", nargs="+", help="saved agents for an Atari game, instead of training one")
     args = parser.parse_args()
     th.set_num_threads(1)
     envs.register()
+    if args.models:
+        probe_saved(args.game, args.models)
+        return
     is_atari = args.game in MEMORY
     env_id = "atari" if is_atari else f"MinAtar/{args.game}-v1"
     entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
@@ -113,15 +147,11 @@ def main() -> None:
             env = make_vec_env(env_id, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
         model = EqRRainbow("CnnPolicy", env, seed=seed, device="cpu", **settings)
         env = model.get_env() or env  # channels first
-        found = {"new": probe(model, env, args.game, np.random.default_rng(seed))}
+        found = {"new": probe(model, watch(model, env, args.game, np.random.default_rng(seed)))}
         if args.steps:
             model.learn(args.steps)
-            found["trained"] = probe(model, env, args.game, np.random.default_rng(seed))
-        columns = [(when, what) for when in found for what in ("trunk", "state")]
-        print(f"| seed {seed} | {' | '.join(f'{when}, {what}' for when, what in columns)} |")
-        print("|---|" + "---|" * len(columns))
-        for name in found["new"]["state"]:
-            print(f"| {name} | " + " | ".join(f"{found[when][what].get(name, np.nan):.2f}" for when, what in columns) + " |")
+            found["trained"] = probe(model, watch(model, env, args.game, np.random.default_rng(seed)))
+        print_table(f"seed {seed}", found)
         print(json.dumps(args.changes), flush=True)
 
 
