@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from sb3_eqr.benchmark.scores import load_results
 from sb3_eqr.common.files import atomic_write
@@ -69,7 +69,7 @@ def draw(ax: Axes, title: str, by_agent: dict[str, list[pd.Series]]) -> None:
     if PANELS[title] in LOGARITHMIC:
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a decade has three ticks: many curves stay within one
-        ax.yaxis.set_major_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(np.inf, np.inf)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
 
 
