@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch as th
+from torch import nn
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -22,7 +23,8 @@ SMALL = {
 N_ATOMS = 9
 
 # policy_kwargs of the paper's network, without the changes of docs/gradients.md; PAPER_FLAT also has no trunk, for vectors.
-PAPER = {"layer_norm": False, "head_input": "state", "projection": "head", "latent_tau": None, "sigma_init": 0.5}
+PAPER = {"layer_norm": False, "head_input": "state", "latent_norm": "batch", "projection": "head"}
+PAPER |= {"latent_tau": None, "sigma_init": 0.5}
 PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
 # For tests that must pass with both networks.
 NETWORKS = {"default": {}, "paper": PAPER}
@@ -58,7 +60,8 @@ def untrained(model, before):
     The names of the trainable parameters that equal those of the state dict ``before``. Batch norm subtracts the bias of the
     layer before it, so such a bias has no gradient, and may stay.
     """
-    without_gradient = {f"{name}.0.bias" for name, module in model.policy.named_modules() if isinstance(module, HiddenLayer)}
+    layers = [(name, m) for name, m in model.policy.named_modules() if isinstance(m, HiddenLayer)]
+    without_gradient = {f"{name}.0.bias" for name, layer in layers if isinstance(layer[1], nn.BatchNorm1d)}
     trainable = {name: p for name, p in model.policy.named_parameters() if p.requires_grad and name not in without_gradient}
     return [name for name, parameter in trainable.items() if th.equal(before[name], parameter)]
 

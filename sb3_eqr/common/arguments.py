@@ -138,6 +138,7 @@ POLICY: dict[str, Rule] = {
     "sigma_init": WEIGHT,
     "transition": one_of(["group", "convolutional"]),
     "latent_hidden_dim": integer(1),
+    "latent_norm": one_of(["layer", "batch"]),
     "projection": one_of(["head", "own", "none"]),
     "predictor": FLAG,
     "latent_tau": SHARE | NONE,

@@ -18,6 +18,7 @@ class ConvLatentModel(LatentModel):
     :param hidden_dim: width of the hidden layer of r_ψ
     :param reward_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`
     :param aet_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`; SPR uses "distance"
+    :param norm: of r_ψ, as in :class:`~sb3_eqr.common.latent_model.LatentModel`
     """
 
     def __init__(
@@ -27,9 +28,10 @@ class ConvLatentModel(LatentModel):
         hidden_dim: int = 256,
         reward_loss: str = "mse",
         aet_loss: str = "distance",
+        norm: str = "layer",
     ):
         channels, height, width = map_shape
-        super().__init__(channels * height * width, n_actions, hidden_dim, reward_loss, aet_loss)
+        super().__init__(channels * height * width, n_actions, hidden_dim, reward_loss, aet_loss, norm=norm)
         self.map_shape = map_shape
         self.transition = nn.Sequential(
             nn.Conv2d(channels + n_actions, channels, 3, padding=1),

@@ -42,6 +42,7 @@ class LatentModel(nn.Module):
     :param reward_loss: "mse" (Eq. 17) or "categorical" (the sign of the reward, as in the authors' released code)
     :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
     :param embedding: module from the encoder's features to latent states; ``None``: the features are the latent states
+    :param norm: of the hidden layers, see :class:`~sb3_eqr.common.rollout.HiddenLayer`
     :raises ValueError: if a loss is unknown
     """
 
@@ -57,6 +58,7 @@ class LatentModel(nn.Module):
         reward_loss: str,
         aet_loss: str,
         embedding: nn.Module | None = None,
+        norm: str = "layer",
     ):
         super().__init__()
         self.embedding = embedding or nn.Identity()  # has a target copy
@@ -66,7 +68,7 @@ class LatentModel(nn.Module):
         self.n_actions = n_actions
         self.aet_loss = aet_loss
         n_outputs, self._reward_loss = REWARD_LOSSES[reward_loss]
-        self.reward_net = HiddenLayer(state_dim, hidden_dim, n_outputs)  # r_ψ
+        self.reward_net = HiddenLayer(state_dim, hidden_dim, n_outputs, norm)  # r_ψ
 
     def forward(
         self,
@@ -137,6 +139,7 @@ class GroupLatentModel(LatentModel):
     :param aet_loss: as in :class:`LatentModel`
     :param state_dependent_actions: ``True``: κ(s, a); ``False``: κ(a), as in Example 2
     :param embedding: as in :class:`LatentModel`
+    :param norm: as in :class:`LatentModel`; κ(a) has none
     :raises ValueError: if a loss is unknown
     """
 
@@ -150,21 +153,22 @@ class GroupLatentModel(LatentModel):
         aet_loss: str = "distance",
         state_dependent_actions: bool = True,
         embedding: nn.Module | None = None,
+        norm: str = "layer",
     ):
         group = group.for_actions
         state_dim = n_blocks * prod(group.element_shape)
-        super().__init__(state_dim, n_actions, hidden_dim, reward_loss, aet_loss, embedding)
+        super().__init__(state_dim, n_actions, hidden_dim, reward_loss, aet_loss, embedding, norm)
         self.group = group
         self.n_blocks = n_blocks
         self.has_symmetry_loss = group.has_inverse
         algebra_dim = n_blocks * group.num_params
         self.state_dependent_actions = state_dependent_actions
         if state_dependent_actions:
-            self.transition = HiddenLayer(state_dim + n_actions, hidden_dim, algebra_dim)  # κ
+            self.transition = HiddenLayer(state_dim + n_actions, hidden_dim, algebra_dim, norm)  # κ
         else:  # no batch norm: κ(a) would vary with the actions drawn into the batch
             layers = nn.Linear(n_actions, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, algebra_dim)
             self.transition = nn.Sequential(*layers)
-        self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim)  # ρ
+        self.action_symmetry = HiddenLayer(state_dim, hidden_dim, algebra_dim, norm)  # ρ
         self.projection = nn.Linear(state_dim, hidden_dim)  # b
         if group.has_inverse:
             self._start_near_identity()

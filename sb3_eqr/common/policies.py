@@ -36,8 +36,8 @@ Network = TypeVar("Network", bound="EqRNetwork")
 
 DEFAULT_NET_ARCH = (256,)  # appendix B.4
 OWN_ARGUMENTS = ["group", "n_blocks", "parameterization", "whiten", "layer_norm", "center", "head_input", "dueling"]
-OWN_ARGUMENTS += ["noisy", "sigma_init", "transition", "latent_hidden_dim", "projection", "predictor", "latent_tau"]
-OWN_ARGUMENTS += ["state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
+OWN_ARGUMENTS += ["noisy", "sigma_init", "transition", "latent_hidden_dim", "latent_norm", "projection", "predictor"]
+OWN_ARGUMENTS += ["latent_tau", "state_dependent_actions", "act_with_target", "reward_loss", "aet_loss"]
 
 
 class EqRPolicy(BasePolicy):
@@ -81,6 +81,8 @@ class EqRPolicy(BasePolicy):
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
         (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None`` and an image trunk
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
+    :param latent_norm: norm of these layers: "layer", or "batch" (appendix B.4), with which an unusual state in a batch
+        changes the predictions for all others (docs/gradients.md)
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or
         "none", the state itself (§5)
     :param predictor: whether to add a linear layer after p on the online side only, as in SPR
@@ -132,6 +134,7 @@ class EqRPolicy(BasePolicy):
         sigma_init: float = 0.1,
         transition: str = "group",
         latent_hidden_dim: int = 256,
+        latent_norm: str = "layer",
         projection: str = "own",
         predictor: bool = False,
         latent_tau: float | None = 1.0,
@@ -164,6 +167,7 @@ class EqRPolicy(BasePolicy):
         self.transition = transition
         self._frozen: list[nn.Module] = []
         self.latent_hidden_dim = latent_hidden_dim
+        self.latent_norm = latent_norm
         self.dueling = dueling
         self.noisy = noisy
         self.sigma_init = sigma_init
@@ -282,16 +286,17 @@ class EqRPolicy(BasePolicy):
         sizes, losses = (int(self.action_space.n), self.latent_hidden_dim), (self.reward_loss, self.aet_loss)
         if self.transition == "convolutional":
             self.state_dim = encoder.features_dim
-            return ConvLatentModel(map_shape(encoder), *sizes, *losses)
+            return ConvLatentModel(map_shape(encoder), *sizes, *losses, norm=self.latent_norm)
         if self.group is None:
             self.state_dim = encoder.features_dim
             blocks: tuple[Group, int] = NoGroup(encoder.features_dim), 1
-            return GroupLatentModel(*blocks, *sizes, *losses, self.state_dependent_actions)
+            return GroupLatentModel(*blocks, *sizes, *losses, self.state_dependent_actions, norm=self.latent_norm)
         layer = encoder.group_layer if isinstance(encoder, GroupFeaturesExtractor) else None
         made = layer or GroupLayer(encoder.features_dim, **self._group_kwargs)
         self.state_dim = made.state_dim
         embedding = made if layer is None else None
-        return GroupLatentModel(made.group, made.n_blocks, *sizes, *losses, self.state_dependent_actions, embedding)
+        given = made.group, made.n_blocks
+        return GroupLatentModel(*given, *sizes, *losses, self.state_dependent_actions, embedding, self.latent_norm)
 
     def _make_target_copies(self) -> None:
         latents: list[tuple[nn.Module | None, nn.Module | None]] = [

@@ -1,4 +1,4 @@
-"""The latent networks, with one hidden layer and batch norm, and the latent rollout, which applies κ repeatedly (Eq. 10)."""
+"""The latent networks, with one normalised hidden layer, and the latent rollout, which applies κ repeatedly (Eq. 10)."""
 
 from typing import Any
 
@@ -9,18 +9,22 @@ from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group
 
+Norm = nn.LayerNorm | nn.BatchNorm1d
+NORMS: dict[str, type[Norm]] = {"layer": nn.LayerNorm, "batch": nn.BatchNorm1d}
+
 
 class HiddenLayer(nn.Sequential):
     """
-    Linear layer, batch norm, ReLU, linear layer: the architecture of κ, r_ψ and ρ (appendix B.4).
+    Linear layer, norm, ReLU, linear layer: the architecture of κ, r_ψ and ρ (appendix B.4, where the norm is batch norm).
 
     :param n_in: size of the input
     :param n_hidden: H
     :param n_out: size of the output
+    :param norm: "layer" or "batch"
     """
 
-    def __init__(self, n_in: int, n_hidden: int, n_out: int):
-        super().__init__(nn.Linear(n_in, n_hidden), nn.BatchNorm1d(n_hidden), nn.ReLU(), nn.Linear(n_hidden, n_out))
+    def __init__(self, n_in: int, n_hidden: int, n_out: int, norm: str = "layer"):
+        super().__init__(nn.Linear(n_in, n_hidden), NORMS[norm](n_hidden), nn.ReLU(), nn.Linear(n_hidden, n_out))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """Map (B, n_in) to (B, n_out)."""
@@ -29,18 +33,25 @@ class HiddenLayer(nn.Sequential):
         return _HiddenLayer.apply(inputs, *weights, norm)
 
 
-def _activate(before: th.Tensor, norm: nn.BatchNorm1d) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-    """Batch norm and ReLU of (B, H), without an autograd graph, and the tensors that :func:`_activate_backward` needs."""
-    statistics: Any = norm.running_mean, norm.running_var, norm.training, norm.momentum, norm.eps
-    normed, mean, inverse_deviation = th.native_batch_norm(before, norm.weight, norm.bias, *statistics)
+def _activate(before: th.Tensor, norm: Norm) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
+    """Norm and ReLU of (B, H), without an autograd graph, and the tensors that :func:`_activate_backward` needs."""
+    if isinstance(norm, nn.LayerNorm):
+        found = th.native_layer_norm(before, norm.normalized_shape, norm.weight, norm.bias, norm.eps)
+    else:
+        statistics: Any = norm.running_mean, norm.running_var, norm.training, norm.momentum, norm.eps
+        found = th.native_batch_norm(before, norm.weight, norm.bias, *statistics)
+    normed, mean, inverse_deviation = found
     hidden = normed.relu_()
     return hidden, (before, hidden, norm.weight, mean, inverse_deviation)
 
 
-def _activate_backward(gradient: th.Tensor, saved: tuple[th.Tensor, ...], norm: nn.BatchNorm1d) -> tuple[th.Tensor, ...]:
+def _activate_backward(gradient: th.Tensor, saved: tuple[th.Tensor, ...], norm: Norm) -> tuple[th.Tensor, ...]:
     """The gradients of :func:`_activate`'s input, (B, H), and of scale and shift, (H,), from the gradient of its result."""
     before, hidden, scale, *moments = saved
     of_normed = th.ops.aten.threshold_backward(gradient, hidden, 0)
+    if isinstance(norm, nn.LayerNorm):
+        arguments = norm.normalized_shape, *moments, scale, norm.bias, [True] * 3
+        return th.ops.aten.native_layer_norm_backward(of_normed, before, *arguments)
     statistics = norm.running_mean, norm.running_var, *moments, norm.training, norm.eps
     return th.ops.aten.native_batch_norm_backward(of_normed, before, scale, *statistics, [True] * 3)
 
@@ -58,7 +69,7 @@ class _HiddenLayer(th.autograd.Function):
         shift: th.Tensor,
         last_weight: th.Tensor,
         last_bias: th.Tensor,
-        norm: nn.BatchNorm1d,
+        norm: Norm,
     ) -> th.Tensor:
         hidden, saved = _activate(F.linear(inputs, weight, bias), norm)
         ctx.norm = norm
@@ -110,7 +121,7 @@ class _Rollout(th.autograd.Function):
         last_weight: th.Tensor,
         last_bias: th.Tensor,
         group: Group,
-        norm: nn.BatchNorm1d,
+        norm: Norm,
     ) -> th.Tensor:
         transposed, last_transposed = weight.mT, last_weight.mT
         blocks = state.view(len(state), -1, *group.element_shape)  # (B, K, ...)

@@ -37,7 +37,7 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
                     f"load_representation: {name}.{key} must be the same in both agents, got {expected.get(key, 'missing')} "
                     f"here and {given.get(key, 'missing')} in the file. Build this agent with the policy_kwargs of the saved "
                     "agent (head_input, group, n_blocks, parameterization, whiten, layer_norm, trunk, latent_hidden_dim, "
-                    "state_dependent_actions), for the same observations and actions."
+                    "latent_norm, state_dependent_actions), for the same observations and actions."
                 )
     for name, module in modules.items():
         module.load_state_dict(found[name])

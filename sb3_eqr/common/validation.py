@@ -200,7 +200,7 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
 
 
 def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, initial_gamma: float | None) -> None:
-    """Raise ValueError if there is no loss, if the batch is too small for batch norm, or if γ = 1 is to be annealed."""
+    """Raise ValueError if there is no loss, if a batch has no pairs, or if γ = 1 is to be annealed."""
     if td_coef == 0 and depth == 0:
         raise ValueError(
             "td_coef must be > 0 if all auxiliary losses are disabled, got 0. "
@@ -208,7 +208,7 @@ def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, init
         )
     if depth > 0 and batch_size < 2:
         raise ValueError(
-            f"batch_size must be an integer >= 2 for the latent model's batch norm, got {batch_size}. "
+            f"batch_size must be an integer >= 2 for the auxiliary losses, which pair samples, got {batch_size}. "
             "Pass a larger batch_size, or prediction_depth=0."
         )
     if initial_gamma is not None and max(initial_gamma, gamma) == 1:

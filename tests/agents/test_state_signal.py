@@ -53,7 +53,7 @@ def test_a_head_on_the_trunk_needs_its_own_projection():
 
 
 @pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
-@pytest.mark.parametrize("share", [None, 0.05])
+@pytest.mark.parametrize("share", [None, 0.02])
 @pytest.mark.parametrize("head_input", ["state", "trunk"])
 def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input):
     """Computed loss by loss: each one gives its gradient at the state and at the encoder's weights."""

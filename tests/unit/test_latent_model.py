@@ -92,11 +92,11 @@ def test_every_loss_uses_the_mask():
     assert all((loss == 0).all() for loss in losses)
 
 
-def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", batch=6, depth=4, seed=0):
+def random_case(group="SE(2)", n_blocks=3, reward_loss="mse", norm="layer", batch=6, depth=4, seed=0):
     th.manual_seed(seed)
     made = make_group(group)
-    model = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
-    target = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss).double()
+    model = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss, norm=norm).double()
+    target = GroupLatentModel(made, n_blocks, 5, hidden_dim=16, reward_loss=reward_loss, norm=norm).double()
     target.requires_grad_(False).eval()
     params = th.randn(batch, depth + 1, n_blocks, made.num_params, dtype=th.float64)
     case = {
@@ -167,10 +167,11 @@ def test_against_loops_over_samples_and_blocks():
         assert losses.symmetry[i].item() == pytest.approx(get, rel=1e-10)
 
 
+@pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize("reward_loss", ["mse", "categorical"])
-def test_masked_steps_have_no_influence(reward_loss):
+def test_masked_steps_have_no_influence(reward_loss, norm):
     """Nor on the other samples, although batch norm sees all of them."""
-    model, case = random_case(reward_loss=reward_loss)
+    model, case = random_case(reward_loss=reward_loss, norm=norm)
     model.train()
     case["mask"] = th.tensor([[1, 1, 1, 1]] * 4 + [[1, 0, 0, 0], [1, 1, 1, 0]], dtype=th.float64)
     case["state"].requires_grad_()
@@ -190,6 +191,20 @@ def test_masked_steps_have_no_influence(reward_loss):
     before = run()
     after = run(rewards=rewards, actions=actions, target_rollout=targets)
     assert all(th.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+def test_an_unusual_state_changes_the_others_with_batch_norm_only(norm):
+    model, case = random_case(norm=norm)
+    usual = case["state"]
+    unusual = usual.clone()
+    unusual[0] *= 100
+    with th.no_grad():
+        before, after = (model.rollout(state, case["actions"])[1:] for state in (usual, unusual))
+    assert th.equal(before, after) == (norm == "layer")
+    with th.no_grad():
+        acting = model.eval().rollout(usual, case["actions"])[1:]
+    assert th.equal(before, acting) == (norm == "layer")  # the same predictions in training and after it
 
 
 def test_each_loss_trains_its_networks_only():
