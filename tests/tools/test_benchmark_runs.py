@@ -12,10 +12,12 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
+from benchmarks import packed_runs
 from sb3_eqr.benchmark import training
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
 from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, Run, Settings
+from sb3_eqr.benchmark.scores import load_results
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
@@ -361,3 +363,18 @@ def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
     result = result_of(run)
     assert not result["resumed_exactly"] and result["resumed_at"] == [96]
     assert result["training"]["step"] and result["evaluations"][-1]["step"] == 300
+
+
+def test_packed_runs_come_back(tmp_path):
+    """In two parts, of which the file keeps both."""
+    file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
+    plan = {"agent": "dqn", "game": "Pong", "suite": "s", "protocol": {"steps": 9}, "entry": {}, "command": "run"}
+    for seed in (0, 1):
+        path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Pong" / str(seed) / RESULT
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(plan | {"seed": seed, "evaluations": [{"scores": [0.5]}]}))
+        assert packed_runs.pack(tmp_path / f"part{seed}", file) == seed + 1
+    assert [packed_runs.unpack(back, file) for _ in range(2)] == [2, 0]
+    found = load_results(back)
+    assert [run["seed"] for run in found] == [0, 1] and found[1]["evaluations"] == [{"scores": [0.5]}]
+    assert json.loads((back / "runs/dqn/Pong/1/run.json").read_text()) == plan | {"seed": 1}

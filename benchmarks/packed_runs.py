@@ -1,0 +1,60 @@
+"""
+Finished runs of a benchmark as one compressed file, a line per run, and back. Packing adds to a file that exists. After
+unpacking, the command of the benchmark skips these runs.
+
+    python -m benchmarks.packed_runs pack runs/minatar docs/results/minatar_30k.jsonl.xz
+    python -m benchmarks.packed_runs unpack runs/minatar docs/results/minatar_30k.jsonl.xz
+"""
+
+import argparse
+import json
+import lzma
+import pathlib
+from typing import Any
+
+from sb3_eqr.benchmark.runs import PLAN, RESULT, write_json
+from sb3_eqr.common.files import atomic_write
+
+PLANNED = "agent game seed suite protocol entry command".split()  # the fields of a run's plan, which its result repeats
+
+
+def read(file: pathlib.Path) -> dict[str, dict[str, Any]]:
+    """:return: folder of a run, relative to the benchmark's ``runs/`` -> its result"""
+    with lzma.open(file, "rt", encoding="utf-8") as lines:
+        rows = [json.loads(line) for line in lines]
+    return {row["folder"]: row["result"] for row in rows}
+
+
+def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
+    """
+    :param folder: folder of a benchmark
+    :param file: the file, which keeps rows of runs that are not in the folder
+    :return: number of rows in the file
+    """
+    rows = read(file) if file.exists() else {}
+    for path in folder.glob(f"runs/*/*/*/{RESULT}"):
+        rows[str(path.parent.relative_to(folder / "runs"))] = json.loads(path.read_text(encoding="utf-8"))
+    lines = [json.dumps({"folder": name, "result": rows[name]}) + "\n" for name in sorted(rows)]
+    with atomic_write(file, "file") as out:
+        out.write(lzma.compress("".join(lines).encode()))
+    return len(rows)
+
+
+def unpack(folder: pathlib.Path, file: pathlib.Path) -> int:
+    """:return: number of runs in the file that the folder did not hold and holds now"""
+    rows = read(file)
+    missing = [name for name in rows if not (folder / "runs" / name / RESULT).exists()]
+    for name in missing:
+        write_json(folder / "runs" / name / PLAN, {key: rows[name][key] for key in PLANNED})
+        write_json(folder / "runs" / name / RESULT, rows[name])
+    return len(missing)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("direction", choices=["pack", "unpack"])
+    parser.add_argument("folder", type=pathlib.Path)
+    parser.add_argument("file", type=pathlib.Path)
+    args = parser.parse_args()
+    number = (pack if args.direction == "pack" else unpack)(args.folder, args.file)
+    print(f"{number} runs")
