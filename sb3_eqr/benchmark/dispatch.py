@@ -104,7 +104,10 @@ def _start_ray(address: str | None) -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # as Ray's own warning recommends
     local: dict[str, Any] = {} if address else {"include_dashboard": False}
-    ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
+    try:
+        ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
+    except ConnectionError as error:
+        raise ConnectionError(f"{error}. If it asks for a token, set RAY_AUTH_MODE=token (docs/benchmark.md).") from error
     return ray
 
 
