@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from sb3_eqr.benchmark.scores import load_results
 from sb3_eqr.common.files import atomic_write
@@ -66,9 +66,11 @@ def draw(ax: Axes, title: str, by_agent: dict[str, list[pd.Series]]) -> None:
             ax.plot(steps, table.mean(axis=1), color=look.color, linestyle=look.line, linewidth=1.2, label=agent)
             ax.fill_between(steps, table.min(axis=1), table.max(axis=1), color=look.color, alpha=0.15, linewidth=0)
     ax.set_title(title, loc="left")
+    ax.set_xlim(left=0)
     if PANELS[title] in LOGARITHMIC:
         ax.set_yscale("log")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a decade has three ticks: many curves stay within one
+        low, high = ax.get_ylim()  # many curves stay within a decade: three ticks in each, or a few at equal distances
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 5 * low else MaxNLocator(4))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
 
