@@ -1,9 +1,10 @@
 """
-Finished runs of a benchmark as one compressed file, a line per run, and back. Packing adds to a file that exists. After
-unpacking, the command of the benchmark skips these runs.
+Finished runs of a benchmark as one compressed file, a line per run, and back. Packing adds to a file that exists. An unpacked
+folder can be reported, and the command of the benchmark skips its runs.
 
     python -m benchmarks.packed_runs pack runs/minatar docs/results/minatar_30k.jsonl.xz
     python -m benchmarks.packed_runs unpack runs/minatar docs/results/minatar_30k.jsonl.xz
+    sb3-eqr benchmark report runs/minatar
 """
 
 import argparse
@@ -12,7 +13,8 @@ import lzma
 import pathlib
 from typing import Any
 
-from sb3_eqr.benchmark.runs import PLAN, RESULT, write_json
+from sb3_eqr.benchmark.runs import PLAN, RESULT, write_json, write_plan
+from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.common.files import atomic_write
 
 PLANNED = "agent game seed suite protocol entry command".split()  # the fields of a run's plan, which its result repeats
@@ -41,12 +43,18 @@ def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
 
 
 def unpack(folder: pathlib.Path, file: pathlib.Path) -> int:
-    """:return: number of runs in the file that the folder did not hold and holds now"""
-    rows = read(file)
+    """
+    Skips rows of runs that had not finished when they were packed.
+
+    :return: number of runs in the file that the folder did not hold and holds now
+    """
+    rows = {name: row for name, row in read(file).items() if row.keys() >= set(PLANNED)}
     missing = [name for name in rows if not (folder / "runs" / name / RESULT).exists()]
     for name in missing:
         write_json(folder / "runs" / name / PLAN, {key: rows[name][key] for key in PLANNED})
         write_json(folder / "runs" / name / RESULT, rows[name])
+    for name, game, steps in sorted({(row["suite"], row["game"], row["protocol"]["steps"]) for row in rows.values()}):
+        write_plan(folder, choose(load_suite(name), [game], steps), [])
     return len(missing)
 
 

@@ -81,7 +81,10 @@ def run(args: argparse.Namespace) -> int:
         gym_packages=args.gym_packages,
         save_models=args.save_models,
     )
-    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, Console())
+    console = Console()
+    if not console.is_terminal:  # which shows a table that changes
+        print(f"Progress: sb3-eqr benchmark status {shlex.quote(str(args.folder))}", flush=True)
+    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
     for lost in failed:
         print(f"failed: {lost.label}: {lost.folder / ERROR}")
     if failed:

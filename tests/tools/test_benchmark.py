@@ -324,7 +324,7 @@ def test_our_suites(tmp_path):
     assert {game.lower() for game in atari.games} == set(reference["game"]) and set(atari.steps.values()) == {100_000}
     assert atari.normalisation.scores["Pong"] == [-20.7, 14.6]  # the paper's Table 2
     assert load_suite("atari100k-5").games == ["Assault", "BattleZone", "Boxing", "ChopperCommand", "Qbert"]
-    for name in ("atari100k", "atari100k-5", "minatar", "classic", "smoke"):
+    for name in ("atari100k", "atari100k-5", "minatar", "classic", "smoke", "smoke-atari"):
         suite = choose(load_suite(name), None, None)
         assert suite.normalisation.scores.keys() == set(suite.games), name
         assert all(high > low for low, high in suite.normalisation.scores.values())

@@ -16,9 +16,9 @@ from benchmarks import packed_runs
 from sb3_eqr.benchmark import training
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
-from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, Run, Settings
+from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, SUITE, Run, Settings
 from sb3_eqr.benchmark.scores import load_results
-from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.benchmark.suites import choose, load_suite, read_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.common.env_state import capture, restore
@@ -366,15 +366,21 @@ def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
 
 
 def test_packed_runs_come_back(tmp_path):
-    """In two parts, of which the file keeps both."""
+    """In two parts, of which the file keeps both, with the suite that a report needs, and without an unfinished run."""
     file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
-    plan = {"agent": "dqn", "game": "Pong", "suite": "s", "protocol": {"steps": 9}, "entry": {}, "command": "run"}
+    plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}, "command": "run"}
     for seed in (0, 1):
-        path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Pong" / str(seed) / RESULT
+        path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Boxing" / str(seed) / RESULT
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps(plan | {"seed": seed, "evaluations": [{"scores": [0.5]}]}))
         assert packed_runs.pack(tmp_path / f"part{seed}", file) == seed + 1
+    unfinished = tmp_path / "part2" / "runs" / "dqn" / "Boxing" / "2" / RESULT
+    unfinished.parent.mkdir(parents=True)
+    unfinished.write_text('{"evaluations": []}')
+    assert packed_runs.pack(tmp_path / "part2", file) == 3
     assert [packed_runs.unpack(back, file) for _ in range(2)] == [2, 0]
     found = load_results(back)
     assert [run["seed"] for run in found] == [0, 1] and found[1]["evaluations"] == [{"scores": [0.5]}]
-    assert json.loads((back / "runs/dqn/Pong/1/run.json").read_text()) == plan | {"seed": 1}
+    assert json.loads((back / "runs/dqn/Boxing/1/run.json").read_text()) == plan | {"seed": 1}
+    suite = read_suite(back / SUITE)
+    assert (suite.name, suite.games, suite.steps) == ("atari100k-5", ["Boxing"], {"Boxing": 9})
