@@ -95,8 +95,8 @@ def figure_of(results: list[dict[str, Any]]) -> plt.Figure:
         ax.remove()
     for column in range(2):
         axes[-1 if rows * 2 == len(shown) or column == 0 else -2, column].set_xlabel("steps (thousands)")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    lines = {str(line.get_label()): line for ax in figure.axes for line in ax.get_lines()}  # not every panel has all agents
+    figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=2)
     return figure
 
 
