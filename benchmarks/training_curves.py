@@ -81,6 +81,7 @@ def figure_of(results: list[dict[str, Any]]) -> plt.Figure:
     :return: a panel per quantity that was logged
     """
     by_run = [(result["agent"], curves(result)) for result in results]
+    by_run.sort(key=lambda run: -len(run[1]))  # the agent with most panels has the first colour in every figure
     agents = list(dict.fromkeys(agent for agent, _ in by_run))
     shown = {
         title: {agent: [found[column] for name, found in by_run if name == agent and column in found] for agent in agents}
