@@ -119,8 +119,8 @@ def choose_runs(
             lacks = {game: every - by_game[game] for game in games}
             fewer = [f"{game} lacks {', '.join(map(str, sorted(seeds)))}" for game, seeds in lacks.items() if seeds]
             notes.append(
-                f"{agent} lacks seeds on some games: {'; '.join(fewer)}. Only its seeds "
-                f"{', '.join(map(str, sorted(common)))}, which it has on every game, are compared."
+                f"{agent} lacks seeds on some games: {'; '.join(fewer)}. Only seeds that it has on every game are compared: "
+                f"{', '.join(map(str, sorted(common)))}."
             )
         chosen[agent] = sorted(common)
     return games, chosen, notes

@@ -287,7 +287,7 @@ def test_missing_runs_are_omitted_and_reported(tmp_path, not_drawn):
     text = text_of(page)
     assert "No finished run of any agent: Hero." in text and "dqn has no finished run on Krull." in text
     assert "Only the 2 of 4 games that every agent has are compared: Pong, Boxing." in text
-    assert f"{FULL} lacks seeds on some games: Pong lacks 1. Only its seeds 0, 2, which" in text
+    assert f"{FULL} lacks seeds on some games: Pong lacks 1. Only seeds that it has on every game are compared: 0, 2." in text
     rows = pd.read_csv(page.with_name("aggregates.csv")).set_index(["agent", "metric"])
     kept = matrix(FULL)[[0, 2], :2]
     assert rows.at[(FULL, "mean"), "value"] == pytest.approx(kept.mean()) and rows.at[(FULL, "mean"), "runs"] == 2
