@@ -61,7 +61,7 @@ def draw(ax: Axes, title: str, by_agent: dict[str, list[pd.Series]]) -> None:
     style = looks(list(by_agent))
     for agent, runs in by_agent.items():
         if runs:
-            table = pd.concat(runs, axis=1).sort_index().interpolate("index", limit_area="inside")  # seeds log at different steps
+            table = pd.concat(runs, axis=1).sort_index().interpolate("index", limit_area="inside")  # steps of logs differ
             steps, look = table.index.to_numpy() / 1_000, style[agent]
             ax.plot(steps, table.mean(axis=1), color=look.color, linestyle=look.line, linewidth=1.2, label=agent)
             ax.fill_between(steps, table.min(axis=1), table.max(axis=1), color=look.color, alpha=0.15, linewidth=0)
