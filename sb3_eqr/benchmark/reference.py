@@ -27,7 +27,7 @@ class PublishedMethod(NamedTuple):
 
 # The EqR paper's agents by their losses, and the methods they are usually compared with, from the source with the most runs.
 SHOWN = (
-    PublishedMethod("EqR [EqR Tab4]", "EqR (paper)", 10),
+    PublishedMethod("EqR [EqR Tab4]", "EqR, AET only (paper)", 10),
     PublishedMethod("EqR, L_{GET} [EqR Tab4]", "EqR, GET (paper)", 10),
     PublishedMethod("EqR, L_R [EqR Tab2]", "EqR, R (paper)", 10),
     PublishedMethod("EqR, L_R + L_{GET} [EqR Tab2]", "EqR, R + GET (paper)", 10),
