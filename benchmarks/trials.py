@@ -29,6 +29,8 @@ GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are only fo
 WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # environments with a known symmetry: name -> id, arguments
     "torus": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25]}),  # 256 positions, one is the goal
     "large_torus": ("SlidingBallTorus-v0", {"n_steps": 32, "goal": [0.25, 0.25], "max_episode_steps": 200}),  # 1,024 positions
+    "torus_of_4": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25], "n_distractors": 4}),
+    "torus_of_8": ("SlidingBallTorus-v0", {"n_steps": 16, "goal": [0.25, 0.25], "n_distractors": 8}),
     "pendulum": ("PixelPendulum-v0", {}),
 }
 N_PARTS = 10  # points of a learning curve

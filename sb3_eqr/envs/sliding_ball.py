@@ -11,6 +11,7 @@ from sb3_eqr.common.validation import check_number
 
 SMALLEST_PICTURE = 36  # smallest image that the default convolutions of CnnPolicy accept
 ENLARGED = 4  # scale factor from an observation to a rendered image
+DISTRACTOR_BRIGHTNESS = 0.8  # relative to the ball
 
 
 class SlidingBall(gym.Env):
@@ -20,7 +21,9 @@ class SlidingBall(gym.Env):
     2π / ``n_steps``, independently of the position: SO(2) per axis.
 
     The observation is (size, size, 1), uint8: a white disc of radius size/8 on a black background, wrapped at the edges.
-    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state.
+    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state. Distractors are light grey
+    discs of the same size behind the ball. At every step, each jumps to a random place: they carry no information and cannot be
+    predicted, so the state space and its symmetry are the same, but the ball is harder to see.
 
     :param dimensions: 1, a vertical loop, or 2, a torus
     :param size: height and width of the image, in pixels; at least 36
@@ -28,6 +31,7 @@ class SlidingBall(gym.Env):
     :param goal: ``None``: the reward is always 0 and no episode terminates. Otherwise a position, ``dimensions`` numbers in
         [0, 1): within half a step of it in every axis, the reward is 1 and the episode terminates. Randomly drawn starts
         are never at the goal.
+    :param n_distractors: number of distractors, at least 0
     :param render_mode: "rgb_array": the enlarged image, with the goal as a faint green ring
     :raises ValueError: if an argument is out of range
     """
@@ -40,18 +44,22 @@ class SlidingBall(gym.Env):
         size: int = 48,
         n_steps: int = 16,
         goal: Sequence[float] | None = None,
+        n_distractors: int = 0,
         render_mode: str | None = None,
     ):
         check_number("dimensions", dimensions, 1, 2, whole=True)
         check_number("size", size, SMALLEST_PICTURE, whole=True)
         check_number("n_steps", n_steps, 3, whole=True)
+        check_number("n_distractors", n_distractors, 0, whole=True)
         self.dimensions = dimensions
         self.size = size
         self.n_steps = n_steps
         self.goal = None if goal is None else check_position("goal", goal, dimensions)
+        self.n_distractors = n_distractors
         self.render_mode = render_mode
         self.observation_space = spaces.Box(0, 255, (size, size, 1), np.uint8)
         self.action_space = spaces.Discrete(2 * dimensions)
+        self._distractors = np.zeros((n_distractors, dimensions))  # their positions, drawn at every step
         self._start = np.zeros(dimensions)
         self._moved = np.zeros(dimensions, dtype=np.int64)  # steps since the start: integers, so that a full turn is exact
 
@@ -77,6 +85,7 @@ class SlidingBall(gym.Env):
             self._start = self.np_random.random(self.dimensions)
             while self._at_goal():
                 self._start = self.np_random.random(self.dimensions)
+        self._move_distractors()
         return self.draw(self.position), {"position": self.position}
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -90,7 +99,11 @@ class SlidingBall(gym.Env):
         axis, forwards = divmod(int(action), 2)
         self._moved[axis] = (self._moved[axis] + 2 * forwards - 1) % self.n_steps
         there = self._at_goal()
+        self._move_distractors()
         return self.draw(self.position), float(there), there, False, {"position": self.position}
+
+    def _move_distractors(self) -> None:
+        self._distractors = self.np_random.random((self.n_distractors, self.dimensions))
 
     def get_action_meanings(self) -> list[str]:
         """
@@ -107,12 +120,16 @@ class SlidingBall(gym.Env):
     def draw(self, position: Sequence[float] | np.ndarray) -> np.ndarray:
         """
         :param position: (dimensions,), in [0, 1)
-        :return: the observation at that position, (size, size, 1), uint8
+        :return: the observation at that position, with the distractors of the last step, (size, size, 1), uint8
         :raises ValueError: if the position has the wrong shape or is out of range
         """
-        distance = self._distance(check_position("position", position, self.dimensions))
-        disc = np.clip(self.size / 8 + 0.5 - distance, 0, 1)  # (size, size), how much of each pixel is covered
-        return np.rint(255 * disc).astype(np.uint8)[:, :, None]
+        disc = self._disc(check_position("position", position, self.dimensions))
+        discs = [disc, *(DISTRACTOR_BRIGHTNESS * self._disc(place) for place in self._distractors)]
+        return np.rint(255 * np.max(discs, axis=0)).astype(np.uint8)[:, :, None]
+
+    def _disc(self, position: np.ndarray) -> np.ndarray:
+        """How much of each pixel a disc at a position covers, in [0, 1]: (size, size)."""
+        return np.clip(self.size / 8 + 0.5 - self._distance(position), 0, 1)
 
     def _distance(self, position: np.ndarray) -> np.ndarray:
         """The periodic distance from each pixel's centre to a position, in pixels: (size, size)."""

@@ -91,6 +91,7 @@ def test_a_step_is_fast(env_id):
         (lambda: SlidingBall(3), r"dimensions must be an integer in \[1, 2\], got 3"),
         (lambda: SlidingBall(size=35), "size must be an integer >= 36, got 35"),
         (lambda: SlidingBall(n_steps=2), "n_steps must be an integer >= 3, got 2"),
+        (lambda: SlidingBall(n_distractors=-1), "n_distractors must be an integer >= 0, got -1"),
         (lambda: SlidingBall(goal=[1.0]), r"goal must be .* shape \(1,\) with values in \[0, 1\), got \[1.0\]"),
         (lambda: SlidingBall(goal=[0.1, 0.2]), r"goal must be .* shape \(1,\) .*, got \[0.1, 0.2\]"),
         (lambda: SlidingBall(2).draw([0.1, np.nan]), r"position must be .* shape \(2,\) .*, got \[0.1, nan\]"),
@@ -185,6 +186,25 @@ def test_reaching_the_goal():
     env = SlidingBall(n_steps=3, goal=[0.5])
     starts = np.array([env.reset(seed=seed)[1]["position"][0] for seed in range(100)])
     assert (abs(starts - 0.5) > 1 / 6).all()
+
+
+def test_distractors_jump_behind_the_ball():
+    env, alone = SlidingBall(2, n_distractors=3), SlidingBall(2)
+    observation, info = env.reset(seed=0, options={"position": [0.0, 0.0]})
+    seen = []
+    for action in (0, 1) * 150:
+        ball = alone.draw(info["position"])
+        assert (observation[ball == 255] == 255).all() and (observation >= ball).all()
+        assert observation[ball == 0].max() == 204  # 0.8 of 255
+        seen.append(observation[12:36, 12:36] > 0)  # where the ball never is
+        observation, _, _, _, info = env.step(action)
+    # A disc of radius 6 covers a pixel, at least in part, if its centre is nearer than 6.5: one of three does so independently.
+    assert np.mean(seen) == pytest.approx(1 - (1 - pi * 6.5**2 / 48**2) ** 3, abs=0.01)
+    assert np.mean(seen, axis=0).min() > 0.07 and np.mean(seen, axis=0).max() < 0.27  # everywhere as often: 0.163 ± 0.021
+    again, _ = SlidingBall(2, n_distractors=3).reset(seed=0)
+    assert (again == env.reset(seed=0)[0]).all()
+    start = SlidingBall(2).reset(seed=7)[1]["position"]
+    np.testing.assert_array_equal(env.reset(seed=7)[1]["position"], start)  # distractors do not change the ball's start
 
 
 def test_the_pendulum_matches_gymnasiums():

@@ -32,7 +32,7 @@ WORLDS = {
     "lake": lambda seed: make_vec_env("FrozenLake-v1", 2, seed),
     "chain": lambda seed: make_vec_env(ChainEnv, 2, seed),
     "images": lambda seed: VecFrameStack(make_vec_env(ImageEnv, 2, seed), 4),
-    "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs={"goal": [0.5, 0.5]}),
+    "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs={"goal": [0.5, 0.5], "n_distractors": 2}),
     "pendulum": lambda seed: make_vec_env("PixelPendulum-v0", 2, seed),
     "minatar": minatar,
     "atari": atari,
