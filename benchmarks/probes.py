@@ -13,6 +13,7 @@ import argparse
 import json
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
@@ -100,6 +101,21 @@ def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
     if model.policy.latent_model is not None:
         inputs["state"] = encode(model, th.as_tensor(seen)).cpu().numpy()
     return {what: {name: explained(x, y) for name, y in known.items()} for what, x in inputs.items()}
+
+
+def probe_ball(model: Any, env_kwargs: dict[str, Any]) -> float:
+    """
+    :param env_kwargs: arguments of ``SlidingBallTorus-v0``
+    :return: R² of the ball's position from the trunk's features, at random positions: the mean over the sines and cosines of
+        both angles
+    """
+    world: Any = gym.make("SlidingBallTorus-v0", **env_kwargs).unwrapped
+    starts = [world.reset(seed=seed) for seed in range(N_FRAMES)]
+    seen = th.as_tensor(np.stack([np.moveaxis(observation, 2, 0) for observation, _ in starts]))
+    angles = 2 * np.pi * np.stack([info["position"] for _, info in starts])
+    with th.no_grad():
+        features = np.concatenate([model.policy.online.features(part).numpy() for part in seen.split(250)])
+    return float(np.mean([explained(features, wave) for wave in (*np.sin(angles).T, *np.cos(angles).T)]))
 
 
 def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> None:

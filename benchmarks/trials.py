@@ -50,6 +50,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.logger import KVWriter, Logger
 
+    from benchmarks.probes import probe_ball
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
@@ -90,14 +91,11 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     started = time.monotonic()
     model.learn(steps, log_interval=4 if game in WORLDS else 20)
     seconds = time.monotonic() - started
-    goals = {}
+    goals: dict[str, Any] = {}
     if game in WORLDS:
-        returns = [value for one in env.env_method("get_episode_rewards") for value in one]
-        lengths = [value for one in env.env_method("get_episode_lengths") for value in one]
-        paid = np.flatnonzero(np.array(returns) > 0)
-        goals = {"return_in_all": round(float(np.sum(returns)), 3), "episodes": len(returns)}
-        if len(paid):  # the step of the first reward
-            goals["first_reward_at"] = int(np.cumsum(lengths)[paid[0]])
+        goals = rewards_found(env, steps)
+        if "torus" in game:
+            goals["probe"] = round(probe_ball(model, env_kwargs), 3)
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
@@ -116,6 +114,16 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         **goals,
         "train": {key.removeprefix("train/"): float(f"{value:.4g}") for key, value in logged.items()},
     }
+
+
+def rewards_found(env: Any, steps: int) -> dict[str, Any]:
+    """How often an environment whose only reward is at the end of an episode has paid one, and when."""
+    returns, lengths = ([n for one in env.env_method(f"get_episode_{what}") for n in one] for what in ("rewards", "lengths"))
+    found: dict[str, Any] = {"return_in_all": round(float(np.sum(returns)), 3), "episodes": len(returns)}
+    paid = np.cumsum(lengths)[np.array(returns) > 0]
+    if len(paid):
+        found["first_reward_at"] = int(paid[0])
+    return found | {"rewards_per_part": np.histogram(paid, N_PARTS, (0, steps))[0].tolist()}
 
 
 def merged(entry: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

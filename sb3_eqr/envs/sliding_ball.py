@@ -21,9 +21,10 @@ class SlidingBall(gym.Env):
     2π / ``n_steps``, independently of the position: SO(2) per axis.
 
     The observation is (size, size, 1), uint8: a white disc of radius size/8 on a black background, wrapped at the edges.
-    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state. Distractors are light grey
-    discs of the same size behind the ball. At every step, each jumps to a random place: they carry no information and cannot be
-    predicted, so the state space and its symmetry are the same, but the ball is harder to see.
+    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state.
+
+    Distractors are light grey discs of the same size behind the ball. At every step, each jumps to a random place: they carry
+    no information and cannot be predicted, so the state space and its symmetry are the same, but the ball is harder to see.
 
     :param dimensions: 1, a vertical loop, or 2, a torus
     :param size: height and width of the image, in pixels; at least 36

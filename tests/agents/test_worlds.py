@@ -198,7 +198,7 @@ def test_distractors_jump_behind_the_ball():
         assert observation[ball == 0].max() == 204  # 0.8 of 255
         seen.append(observation[12:36, 12:36] > 0)  # where the ball never is
         observation, _, _, _, info = env.step(action)
-    # A disc of radius 6 covers a pixel, at least in part, if its centre is nearer than 6.5: one of three does so independently.
+    # A disc of radius 6 covers a pixel, at least in part, if its centre is nearer than 6.5; three do so independently.
     assert np.mean(seen) == pytest.approx(1 - (1 - pi * 6.5**2 / 48**2) ** 3, abs=0.01)
     assert np.mean(seen, axis=0).min() > 0.07 and np.mean(seen, axis=0).max() < 0.27  # everywhere as often: 0.163 ± 0.021
     again, _ = SlidingBall(2, n_distractors=3).reset(seed=0)
