@@ -1,11 +1,12 @@
 """
 How well the latent state of an agent encodes the objects in a game: the fraction of variance (R²) of their positions that a
 linear probe explains, on held-out frames; the same for the trunk's features, and for an untrained agent. The positions are
-from MinAtar's planes, and for Atari from the console's memory.
+from MinAtar's planes, for Atari from the console's memory, and for environments with a known symmetry their own.
 
     python -m benchmarks.probes --game Breakout --steps 10000 --seeds 0 1
     python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
     python -m benchmarks.probes --game ALE/Pong --steps 0
+    python -m benchmarks.probes --game torus_of_4 --steps 0
     python -m benchmarks.probes --game ALE/Boxing --models runs/atari/runs/*/Boxing/0/models/*/*/*.zip
 """
 
@@ -19,8 +20,8 @@ import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.trials import merged
-from sb3_eqr import EqRRainbow, envs
+from benchmarks.trials import WORLDS, merged
+from sb3_eqr import EqRQRDQN, EqRRainbow, envs
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.visualize.latents import encode
 
@@ -36,6 +37,7 @@ MEMORY = {
     "ALE/Breakout": {"paddle: x": 72, "ball: x": 99, "ball: y": 101},
 }
 N_FRAMES, TRAINED_ON, RIDGE = 6_000, 4_500, 100.0
+WAVES = {"sine of angle": np.sin, "cosine of angle": np.cos}
 
 
 def targets(planes: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
@@ -103,19 +105,25 @@ def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
     return {what: {name: explained(x, y) for name, y in known.items()} for what, x in inputs.items()}
 
 
-def probe_ball(model: Any, env_kwargs: dict[str, Any]) -> float:
+def scattered(env_id: str, env_kwargs: dict[str, Any]) -> Frames:
     """
-    :param env_kwargs: arguments of ``SlidingBallTorus-v0``
-    :return: R² of the ball's position from the trunk's features, at random positions: the mean over the sines and cosines of
-        both angles
+    Random states of ``SlidingBallTorus-v0`` or ``PixelPendulum-v0``. To be known: sine and cosine of every angle, and the
+    pendulum's velocity.
     """
-    world: Any = gym.make("SlidingBallTorus-v0", **env_kwargs).unwrapped
-    starts = [world.reset(seed=seed) for seed in range(N_FRAMES)]
-    seen = th.as_tensor(np.stack([np.moveaxis(observation, 2, 0) for observation, _ in starts]))
-    angles = 2 * np.pi * np.stack([info["position"] for _, info in starts])
-    with th.no_grad():
-        features = np.concatenate([model.policy.online.features(part).numpy() for part in seen.split(250)])
-    return float(np.mean([explained(features, wave) for wave in (*np.sin(angles).T, *np.cos(angles).T)]))
+    world: Any = gym.make(env_id, **env_kwargs).unwrapped
+    is_pendulum = env_id.startswith("PixelPendulum")
+    velocities = np.random.default_rng(0).uniform(-8, 8, N_FRAMES)  # rad/s; it starts with at most 1
+    options = [{"velocity": velocity} if is_pendulum else None for velocity in velocities]
+    starts = [world.reset(seed=seed, options=option) for seed, option in enumerate(options)]
+    angles = np.stack([np.atleast_1d(info["angle"] if is_pendulum else 2 * np.pi * info["position"]) for _, info in starts])
+    known = {f"{name} {axis}": wave(angle) for axis, angle in enumerate(angles.T) for name, wave in WAVES.items()}
+    seen = np.stack([np.moveaxis(observation, 2, 0) for observation, _ in starts])
+    return seen, known | ({"velocity": velocities} if is_pendulum else {})
+
+
+def frames(model: Any, env: Any, game: str, seed: int) -> Frames:
+    """Random states of an environment with a known symmetry, or what the agent sees in a game."""
+    return scattered(*WORLDS[game]) if game in WORLDS else watch(model, env, game, np.random.default_rng(seed))
 
 
 def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
@@ -139,7 +147,7 @@ def probe_saved(game: str, paths: list[str]) -> None:
 def main() -> None:
     """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--game", choices=[*PLANES, *MEMORY], default="Breakout")
+    parser.add_argument("--game", choices=[*PLANES, *MEMORY, *WORLDS], default="Breakout")
     parser.add_argument("--agent", default="eqr_rainbow", help="a file of zoo_hyperparams")
     parser.add_argument("--changes", type=yaml.safe_load, default={}, help="changes of its entry, as YAML")
     parser.add_argument("--steps", type=int, default=10_000)
@@ -152,21 +160,25 @@ def main() -> None:
         probe_saved(args.game, args.models)
         return
     is_atari = args.game in MEMORY
-    env_id = "atari" if is_atari else f"MinAtar/{args.game}-v1"
-    entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
-    settings = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, args.changes)
+    env_id, env_kwargs = WORLDS.get(args.game, ("atari" if is_atari else f"MinAtar/{args.game}-v1", {}))
+    settings = args.changes
+    if args.game not in WORLDS:
+        entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
+        settings = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, settings)
     settings["buffer_size"] = max(args.steps, 100)
     for seed in args.seeds:
         if is_atari:
             env = envs.make_atari100k_env(args.game.removeprefix("ALE/"), n_envs=1, seed=seed)
         else:
-            env = make_vec_env(env_id, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
-        model = EqRRainbow("CnnPolicy", env, seed=seed, device="cpu", **settings)
+            wrapper = None if args.game in WORLDS else envs.minatar.ChannelsFirstImage
+            env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs, wrapper_class=wrapper)
+        kind = EqRQRDQN if args.game in WORLDS else EqRRainbow
+        model = kind("CnnPolicy", env, seed=seed, device="cpu", **settings)
         env = model.get_env() or env  # channels first
-        found = {"new": probe(model, watch(model, env, args.game, np.random.default_rng(seed)))}
+        found = {"new": probe(model, frames(model, env, args.game, seed))}
         if args.steps:
             model.learn(args.steps)
-            found["trained"] = probe(model, watch(model, env, args.game, np.random.default_rng(seed)))
+            found["trained"] = probe(model, frames(model, env, args.game, seed))
         print_table(f"seed {seed}", found)
         print(json.dumps(args.changes), flush=True)
 

@@ -50,7 +50,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.logger import KVWriter, Logger
 
-    from benchmarks.probes import probe_ball
+    from benchmarks.probes import probe, scattered
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
@@ -94,8 +94,8 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     goals: dict[str, Any] = {}
     if game in WORLDS:
         goals = rewards_found(env, steps)
-        if "torus" in game:
-            goals["probe"] = round(probe_ball(model, env_kwargs), 3)
+        found_by_probes = probe(model, scattered(env_id, env_kwargs))["trunk"]
+        goals["probe"] = round(float(np.mean(list(found_by_probes.values()))), 3)  # R² of the state from the features
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
