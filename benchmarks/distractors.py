@@ -21,8 +21,9 @@ SEEDS = range(3, 10)  # 0 to 2 served to choose the settings
 GAMES = ("torus_of_4", "torus_of_8")
 NAMES = {
     "contrastive": "EqR, contrastive AET loss",
-    "no_group": "the same loss, no group",
-    "default": "EqR, distance as AET loss",
+    "predictor": "EqR, distance and predictor",
+    "no_group": "contrastive loss, no group",
+    "default": "EqR, distance, the default",
     "plain": "Q-learning alone",
 }
 
@@ -59,7 +60,7 @@ def draw(rows: pathlib.Path, picture: pathlib.Path) -> None:
             axis.set(title=f"{WORLDS[game][1]['n_distractors']} distractors", xlabel="steps", ylim=(0, 100))
             axis.grid()
         axes[1].set_ylabel(f"goals reached per {STEPS // N_PARTS} steps")
-        figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower right", ncols=2)
+        figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower right", ncols=3)
         figure.savefig(picture, dpi=150)
         plt.close(figure)
 
