@@ -17,7 +17,7 @@ from sb3_eqr import envs
 from sb3_eqr.plot_style import looks, styled
 
 STEPS = 8_000
-SEEDS = range(3, 10)  # 0 to 2 served to choose the settings
+SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
 GAMES = ("torus_of_4", "torus_of_8")
 NAMES = {
     "contrastive": "EqR, contrastive AET loss",
