@@ -1,7 +1,7 @@
 """
 How well the latent state of an agent encodes the objects in a game: the fraction of variance (R²) of their positions that a
 linear probe explains, on held-out frames; the same for the trunk's features, and for an untrained agent. The positions are
-from MinAtar's planes, for Atari from the console's memory, and for environments with a known symmetry their own.
+from MinAtar's planes, for Atari from the console's memory, and from the environments with a known symmetry themselves.
 
     python -m benchmarks.probes --game Breakout --steps 10000 --seeds 0 1
     python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
@@ -107,8 +107,8 @@ def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
 
 def scattered(env_id: str, env_kwargs: dict[str, Any]) -> Frames:
     """
-    Random states of ``SlidingBallTorus-v0`` or ``PixelPendulum-v0``. To be known: sine and cosine of every angle, and the
-    pendulum's velocity.
+    Random states of ``SlidingBallTorus-v0`` or ``PixelPendulum-v0``; their positions are sine and cosine of every angle, and
+    the pendulum's velocity.
     """
     world: Any = gym.make(env_id, **env_kwargs).unwrapped
     is_pendulum = env_id.startswith("PixelPendulum")
@@ -161,7 +161,7 @@ def main() -> None:
         return
     is_atari = args.game in MEMORY
     env_id, env_kwargs = WORLDS.get(args.game, ("atari" if is_atari else f"MinAtar/{args.game}-v1", {}))
-    settings = args.changes
+    settings = {**args.changes}
     if args.game not in WORLDS:
         entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
         settings = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, settings)

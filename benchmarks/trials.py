@@ -54,6 +54,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
+    from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
     from sb3_eqr.common.latent_model import GroupLatentModel
     from sb3_eqr.configurations import ZOO_KEYS, configuration_files
     from sb3_eqr.visualize.diagnostics import diagnose
@@ -94,8 +95,9 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     goals: dict[str, Any] = {}
     if game in WORLDS:
         goals = rewards_found(env, steps)
-        found_by_probes = probe(model, scattered(env_id, env_kwargs))["trunk"]
-        goals["probe"] = round(float(np.mean(list(found_by_probes.values()))), 3)  # R² of the state from the features
+        if isinstance(model, EqRAlgorithm):
+            found_by_probes = probe(model, scattered(env_id, env_kwargs))["trunk"]
+            goals["probe"] = round(float(np.mean(list(found_by_probes.values()))), 3)  # R² of the state from the features
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
