@@ -110,7 +110,7 @@ def keep_constant_gradient(model: EqRRainbow) -> None:
 
     def forward(layer: Centering, features: th.Tensor) -> th.Tensor:
         if layer.training and th.is_grad_enabled():
-            layer.batch_mean.copy_(features.detach().mean(dim=0))
+            layer.note(features.detach())
         return features - layer.running_mean
 
     for layer in model.policy.online.modules():

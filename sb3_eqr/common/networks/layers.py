@@ -201,40 +201,57 @@ class Centering(nn.Module):
 
     The gradient is centred as well, as if the mean of the batch were subtracted. Otherwise the loss would ask, at each
     update, for a constant that the running mean then removes, and the features would grow without bound (Ioffe and Szegedy
-    2015, section 2, https://arxiv.org/abs/1502.03167). So a batch needs two observations to train what is before this layer.
+    2015, section 2, https://arxiv.org/abs/1502.03167).
 
-    After n batches, the weight of a new one is 1 / (1 + 0.03 n), at least 0.01: the first updates change the mean fast, and a
-    mean that lags behind would leave what it is to remove (docs/gradients.md); later, more batches make it more precise.
+    The weight of a batch is that of James and Stein's estimator, 1 - e / d: d is the squared distance of its mean from the
+    running mean, and e, the variance of the features divided by the size of the batch, is how large d is by chance. So the
+    running mean follows features that move, and averages over batches while they do not. With a fixed weight it lags behind
+    features that move fast, which leaves a constant (docs/gradients.md). Source: Efron and Morris 1973,
+    https://doi.org/10.1080/01621459.1973.10481350, with the running mean as the point to shrink to, and 1 for (D - 2) / D.
+
+    A batch of one observation has no variance: it does not move the running mean, and its gradient is not centred.
 
     :param n_features: D
     """
 
+    SMALLEST_WEIGHT = 0.01  # at rest, average over 100 batches or more
+
     running_mean: th.Tensor  # (D,)
-    running_count: th.Tensor  # n
     batch_mean: th.Tensor  # (D,)
+    batch_error: th.Tensor  # (), e
 
     def __init__(self, n_features: int):
         super().__init__()
         self.register_buffer("running_mean", th.zeros(n_features))
-        self.register_buffer("running_count", th.zeros(()))
         self.register_buffer("batch_mean", th.zeros(n_features), persistent=False)
+        self.register_buffer("batch_error", th.zeros(()), persistent=False)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
         :param features: (B, D)
         :return: (B, D)
         """
-        if self.training and th.is_grad_enabled():
+        if self.training and th.is_grad_enabled() and len(features) > 1:
             mean = features.mean(dim=0)
-            self.batch_mean.copy_(mean.detach())
+            self.note(features.detach())
             features = features - (mean - mean.detach())  # subtracts 0; the gradient loses its mean
         return features - self.running_mean
+
+    def note(self, features: th.Tensor) -> None:
+        """
+        Note the mean of a batch for :meth:`update`.
+
+        :param features: (B, D) without gradient, B ≥ 2
+        """
+        variance, mean = th.var_mean(features, dim=0)
+        self.batch_mean.copy_(mean)
+        self.batch_error.copy_(variance.sum() / len(features))
 
     def update(self) -> None:
         """Called after each gradient step; without effect in eval mode."""
         if self.training:
-            self.running_mean.lerp_(self.batch_mean, (1 / (1 + 0.03 * self.running_count)).clamp(min=0.01))
-            self.running_count += 1
+            distance = (self.batch_mean - self.running_mean).square().sum().clamp(min=1e-30)
+            self.running_mean.lerp_(self.batch_mean, (1 - self.batch_error / distance).clamp(min=self.SMALLEST_WEIGHT))
 
 
 class Whitening(nn.Module):
