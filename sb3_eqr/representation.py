@@ -150,6 +150,7 @@ def train_representation(
             "state_dependent_actions": state_dependent_actions,
             "aet_loss": aet_loss,
             "projection": "none",
+            "predictor": False,
             "layer_norm": False,  # redundant with whitening
             "head_input": "state",
             "latent_tau": None,

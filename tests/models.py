@@ -24,7 +24,7 @@ N_ATOMS = 9
 
 # policy_kwargs of the paper's network, without the changes of docs/gradients.md; PAPER_FLAT also has no trunk, for vectors.
 PAPER = {"layer_norm": False, "head_input": "state", "latent_norm": "batch", "projection": "head"}
-PAPER |= {"latent_tau": None, "sigma_init": 0.5}
+PAPER |= {"predictor": False, "latent_tau": None, "sigma_init": 0.5}
 PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
 # For tests that must pass with both networks.
 NETWORKS = {"default": {}, "paper": PAPER}

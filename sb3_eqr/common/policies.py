@@ -86,7 +86,7 @@ class EqRPolicy(BasePolicy):
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or
         "none", the state itself (§5)
     :param predictor: whether to add a linear layer after p on the online side only, as in SPR
-        (https://arxiv.org/abs/2007.05929), so that a target that is an exact copy does not favour a collapse
+        (https://arxiv.org/abs/2007.05929), without which the AET loss makes latent states alike (docs/gradients.md)
     :param latent_tau: update coefficient of the latent model's target (encoder, p̄, κ̄, b̄) after each gradient step, in
         [0, 1]; 1 copies, as in the paper. ``None``: it is updated together with the target of the Q head
     :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), independent of the state, as in Example 2
@@ -136,7 +136,7 @@ class EqRPolicy(BasePolicy):
         latent_hidden_dim: int = 256,
         latent_norm: str = "layer",
         projection: str = "own",
-        predictor: bool = False,
+        predictor: bool = True,
         latent_tau: float | None = 1.0,
         state_dependent_actions: bool = True,
         act_with_target: bool = False,

@@ -225,7 +225,7 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
     for name, value in new.items():
         if "_target" in name:
             continue
-        if ".head." in name or name.startswith("own_projection."):
+        if ".head." in name or name.startswith(("own_projection.", "predictor_net.")):
             assert th.equal(value, drawn[name]) and not th.equal(value, old[name])
             kinds["fresh"] += 1
         elif "running_" in name or "num_batches" in name:
@@ -406,7 +406,8 @@ def test_weight_decay_applies_to_matrices_only(make, name):
             p.fill_(1.0)
     optimizer.step()
     assert {p.ndim for p in model._trained} == {1, 2}
-    parts = [model.policy.online, model.policy.latent_model, model.policy.own_projection]
+    policy = model.policy
+    parts = [policy.online, policy.latent_model, policy.own_projection, policy.predictor_net]
     for key, p in [named for part in parts for named in part.named_parameters()]:
         assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # decay would remove the noise
     trained = {id(p) for group in optimizer.param_groups for p in group["params"]}

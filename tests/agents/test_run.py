@@ -143,7 +143,7 @@ def test_defaults_are_those_of_table_5(make):
     assert (policy.layer_norm, policy.head_input, policy.projection, policy.latent_tau) == (True, "trunk", "own", 1.0)
     assert isinstance(policy.online.features_extractor, NormalizedExtractor)
     assert isinstance(policy.online.features_extractor.trunk, ConvExtractor)
-    assert policy.own_projection.weight.shape == (256, 72) and policy.predictor_net is None
+    assert policy.own_projection.weight.shape == (256, 72) and policy.predictor_net.weight.shape == (256, 256)
     papers = make.algorithm("CnnPolicy", env, device="cpu", policy_kwargs=PAPER).policy
     assert isinstance(papers.online.features_extractor.trunk, ConvExtractor) and papers.own_projection is None
     for policy, n_features, sigma_init in ((model.policy, 3136, 0.1), (papers, 72, 0.5)):
