@@ -20,10 +20,10 @@ STEPS = 8_000
 SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
 GAMES = ("torus_of_4", "torus_of_8")
 NAMES = {
-    "contrastive": "EqR, contrastive AET loss",
-    "predictor": "EqR, distance and predictor",
-    "no_group": "contrastive loss, no group",
-    "default": "EqR, distance, the default",
+    "default": "EqR, the defaults",
+    "contrastive": "contrastive AET loss",
+    "distance": "AET loss without predictor",
+    "no_group": "the defaults, no group",
     "plain": "Q-learning alone",
 }
 
