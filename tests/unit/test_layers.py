@@ -164,10 +164,10 @@ def test_whitening_has_a_correct_gradient():
 def test_the_running_mean_by_hand():
     """
     The batch (0, 0), (4, 2) has the mean (2, 1); as its features have the variances 8 and 2, the squared error of this mean is
-    (8 + 2) / 2 = 5. From (2, 11), at a squared distance of 100, the weight is 0.95; from (4, 1), at 4, the smallest, 0.01.
+    (8 + 2) / 2 = 5. From (2, 11), at a squared distance of 100, the weight is 0.85; from (4, 1), at 4, the smallest, 0.01.
     """
     layer, batch = Centering(2).double(), th.tensor([[0.0, 0.0], [4.0, 2.0]], dtype=th.float64)
-    for start, expected in ([2.0, 11.0], [2.0, 1.5]), ([4.0, 1.0], [3.98, 1.0]):
+    for start, expected in ([2.0, 11.0], [2.0, 2.5]), ([4.0, 1.0], [3.98, 1.0]):
         layer.running_mean.copy_(th.tensor(start))
         for _ in range(2):  # a call does not change what the next one of the same update subtracts
             np.testing.assert_allclose(layer(batch), batch - th.tensor(start), atol=1e-12)
@@ -182,9 +182,9 @@ def test_the_running_mean_by_hand():
     np.testing.assert_allclose(layer.running_mean, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0, 10.0])
+@pytest.mark.parametrize("speed", [0.0, 0.1, 1.0, 10.0])
 def test_the_running_mean_follows_features_that_move(speed):
-    """It is at most one batch behind, however fast they move; at rest it is more precise than the mean of a batch."""
+    """It is not far behind, however fast they move; at rest it is more precise than the mean of a batch."""
     th.manual_seed(0)
     layer, errors = Centering(8), []
     for step in range(500):
@@ -193,7 +193,7 @@ def test_the_running_mean_follows_features_that_move(speed):
         layer(constant + th.randn(32, 8))
         layer.update()
     of_batch = np.sqrt(8 / 32)
-    assert np.mean(errors[100:]) < (0.7 * of_batch if speed == 0 else speed * np.sqrt(8) + of_batch)
+    assert np.mean(errors[100:]) < (0.2 * of_batch if speed == 0 else speed * np.sqrt(8) + 2 * of_batch)
 
 
 def test_the_gradient_has_no_mean_over_the_batch():

@@ -203,11 +203,11 @@ class Centering(nn.Module):
     update, for a constant that the running mean then removes, and the features would grow without bound (Ioffe and Szegedy
     2015, section 2, https://arxiv.org/abs/1502.03167).
 
-    The weight of a batch is that of James and Stein's estimator, 1 - e / d: d is the squared distance of its mean from the
-    running mean, and e, the variance of the features divided by the size of the batch, is how large d is by chance. So the
-    running mean follows features that move, and averages over batches while they do not. With a fixed weight it lags behind
-    features that move fast, which leaves a constant (docs/gradients.md). Source: Efron and Morris 1973,
-    https://doi.org/10.1080/01621459.1973.10481350, with the running mean as the point to shrink to, and 1 for (D - 2) / D.
+    The weight of a batch is 1 - 3 e / d, at least 0.01: d is the squared distance of its mean from the running mean, and e, the
+    variance of the features divided by the size of the batch, is how large d is by chance, on average; three times as much is
+    rare. So the running mean averages over batches, unless the features have moved. With a fixed weight it lags behind
+    features that move fast, which leaves a constant (docs/gradients.md). With 1 in place of 3 this would be the estimator of
+    James and Stein (Efron and Morris 1973, https://doi.org/10.1080/01621459.1973.10481350), which also follows some chance.
 
     A batch of one observation has no variance: it does not move the running mean, and its gradient is not centred.
 
@@ -215,6 +215,7 @@ class Centering(nn.Module):
     """
 
     SMALLEST_WEIGHT = 0.01  # at rest, average over 100 batches or more
+    BY_CHANCE = 3.0  # a batch that is further away than this times e has moved
 
     running_mean: th.Tensor  # (D,)
     batch_mean: th.Tensor  # (D,)
@@ -251,7 +252,8 @@ class Centering(nn.Module):
         """Called after each gradient step; without effect in eval mode."""
         if self.training:
             distance = (self.batch_mean - self.running_mean).square().sum().clamp(min=1e-30)
-            self.running_mean.lerp_(self.batch_mean, (1 - self.batch_error / distance).clamp(min=self.SMALLEST_WEIGHT))
+            weight = (1 - self.BY_CHANCE * self.batch_error / distance).clamp(min=self.SMALLEST_WEIGHT)
+            self.running_mean.lerp_(self.batch_mean, weight)
 
 
 class Whitening(nn.Module):
