@@ -86,7 +86,8 @@ class EqRPolicy(BasePolicy):
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or
         "none", the state itself (§5)
     :param predictor: whether to add a linear layer after p on the online side only, as in SPR
-        (https://arxiv.org/abs/2007.05929), without which the AET loss makes latent states alike (docs/gradients.md)
+        (https://arxiv.org/abs/2007.05929), without which the AET loss makes latent states alike (docs/gradients.md). It starts
+        as the identity, except with SPR's own transition
     :param latent_tau: update coefficient of the latent model's target (encoder, p̄, κ̄, b̄) after each gradient step, in
         [0, 1]; 1 copies, as in the paper. ``None``: it is updated together with the target of the Q head
     :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), independent of the state, as in Example 2
@@ -260,6 +261,9 @@ class EqRPolicy(BasePolicy):
         if self.predictor:
             width = {"own": self.latent_hidden_dim, "head": self.online.head.projection_dim, "none": self.state_dim}
             self.predictor_net = nn.Linear(width[self.projection], width[self.projection]).to(self.device)
+            if self.transition == "group":  # like κ and ρ around the identity, or the latent model has to undo it first
+                nn.init.eye_(self.predictor_net.weight)
+                nn.init.zeros_(self.predictor_net.bias)
             parameters += self.predictor_net.parameters()
         for module in self.modules():
             if isinstance(module, ConvTrunk):

@@ -141,6 +141,16 @@ def test_the_predictor_is_on_the_online_side_only(projection):
     assert th.equal(policy.target_project(rows), same)  # a copy of the projection, without a predictor
 
 
+def test_a_new_predictor_changes_nothing():
+    """As the identity, except with SPR's own transition, which has PyTorch's weights."""
+    policy, rows = EqRRainbow("MlpPolicy", ChainEnv(), seed=0).policy, th.randn(5, 72)
+    th.testing.assert_close(policy.project(rows), policy.target_project(rows))
+    spr = {"group": None, "transition": "convolutional", "projection": "none", "predictor": True}
+    spr |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]]}}
+    policy = EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, seed=0, policy_kwargs=spr).policy
+    assert policy.predictor_net.weight.diagonal().abs().max() < 0.5
+
+
 def test_spr_trains_saves_and_loads(tmp_path):
     settings = {**SETTINGS, "aet_coef": 5.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
     policy_kwargs = {"group": None, "transition": "convolutional", "predictor": True, "latent_tau": 1.0}
@@ -196,12 +206,12 @@ def test_the_logits_of_a_new_agent_depend_on_the_frames(configuration, low, high
 
 
 def test_the_trunk_does_not_grow_in_the_first_updates():
-    """If the gradient of a constant reached the trunk, its features would be 80 times as large after 100 updates on Boxing."""
+    """If the gradient of a constant reached the trunk, its features would be 60 to 107 times as large after 100 updates on Boxing."""
     settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0}
     model = EqRRainbow("CnnPolicy", make_atari100k_env("Boxing", seed=0), **settings).learn(200)
     trunk, frames = model.policy.online.features_extractor.trunk, model.replay_buffer.sample(64).observations / 255
     before = trunk(frames).max().item()
-    model.train(100, 16)
+    model.train(100, 32)
     assert trunk(frames).max().item() < 5 * before
 
 
