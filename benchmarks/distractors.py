@@ -18,7 +18,7 @@ from sb3_eqr.plot_style import looks, styled
 
 STEPS = 8_000
 SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
-GAMES = ("torus_of_4", "torus_of_8")
+GAMES = ("torus_of_8",)
 NAMES = {
     "default": "EqR, the defaults",
     "contrastive": "contrastive AET loss",
@@ -45,10 +45,10 @@ def draw(rows: pathlib.Path, picture: pathlib.Path) -> None:
     envs.register()
     every = [row for row in read_rows(rows) if row["steps"] == STEPS and row["seed"] in SEEDS]
     with styled():
-        figure, axes = plt.subplots(1, 3, figsize=(9, 3.3), width_ratios=[0.8, 1, 1], layout="constrained")
+        figure, axes = plt.subplots(1, 1 + len(GAMES), figsize=(3 + 3 * len(GAMES), 3.3), layout="constrained")
         env_id, env_kwargs = WORLDS[GAMES[0]]
         axes[0].imshow(gym.make(env_id, **env_kwargs).reset(seed=2)[0], cmap="gray")
-        axes[0].set_title("an observation, 4 distractors")
+        axes[0].set_title(f"an observation, {env_kwargs['n_distractors']} distractors")
         axes[0].set_axis_off()
         steps = np.arange(1, N_PARTS + 1) * STEPS / N_PARTS
         for axis, game in zip(axes[1:], GAMES, strict=True):

@@ -33,6 +33,8 @@ CHANGES: dict[str, dict[str, Any]] = {  # name -> arguments that differ from tho
     "default": {},
     "constant_gradient": {},  # the gradient of what all frames have in common reaches the trunk
     "no_centring": {"policy_kwargs": {"center": False}},
+    "no_predictor": {"policy_kwargs": {"predictor": False}},
+    "random_predictor": {},  # the predictor starts with PyTorch's initial weights
     "random_actions": {},  # κ and ρ start with PyTorch's initial weights
     "neither": {"policy_kwargs": {"center": False}},  # no centring, random actions
     "no_losses": {"aux_gradient_share": 0.0, "policy_kwargs": {"center": False}},  # as "neither"; only TD trains the encoder
@@ -134,6 +136,9 @@ def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frame
         networks: tuple[Any, ...] = model.policy.latent_model.transition, model.policy.latent_model.action_symmetry
         for *_, last in networks:
             last.reset_parameters()
+    if configuration == "random_predictor":
+        predictor: Any = model.policy.predictor_net
+        predictor.reset_parameters()
     if configuration == "constant_gradient":
         keep_constant_gradient(model)
     model.learn(n_frames)

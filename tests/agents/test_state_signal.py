@@ -206,7 +206,7 @@ def test_the_logits_of_a_new_agent_depend_on_the_frames(configuration, low, high
 
 
 def test_the_trunk_does_not_grow_in_the_first_updates():
-    """If the gradient of a constant reached the trunk, its features would be 60 to 107 times as large after 100 updates on Boxing."""
+    """If the gradient of a constant reached the trunk, its features would grow by a factor of 60 to 107 on Boxing."""
     settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0}
     model = EqRRainbow("CnnPolicy", make_atari100k_env("Boxing", seed=0), **settings).learn(200)
     trunk, frames = model.policy.online.features_extractor.trunk, model.replay_buffer.sample(64).observations / 255
