@@ -48,6 +48,12 @@ PROMISES: dict[str, dict[str, Promise]] = {
             code=('"projection": one_of(["head", "own", "none"])', '"n_quantiles": integer(1)'), text=("`POLICY`",)
         ),
     },
+    "gradients.md": {
+        "sb3_eqr/common/networks/layers.py, Centering.update": Promise(
+            code=("(1 - self.BY_CHANCE * self.batch_error / distance)", "self.running_mean.lerp_("),
+            text=("`Centering.update`", "1 − 3 e / d"),
+        ),
+    },
     "losses.md": {
         "sb3_eqr/common/objective.py, Objective.__call__": Promise(
             code=(

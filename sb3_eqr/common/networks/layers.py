@@ -203,7 +203,7 @@ class Centering(nn.Module):
     update, for a constant that the running mean then removes, and the features would grow without bound (Ioffe and Szegedy
     2015, section 2, https://arxiv.org/abs/1502.03167).
 
-    The weight of a batch is 1 - 3 e / d, at least 0.01: d is the squared distance of its mean from the running mean, and e, the
+    The weight of a batch is 1 - 3 e / d, at least 0.01. d is the squared distance of its mean from the running mean; e, the
     variance of the features divided by the size of the batch, is how large d is by chance, on average; three times as much is
     rare. So the running mean averages over batches, unless the features have moved. With a fixed weight it lags behind
     features that move fast, which leaves a constant (docs/gradients.md). With 1 in place of 3 this would be the estimator of
