@@ -75,6 +75,9 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     :param n_atoms: number of atoms of the return distribution, ≥ 2; 51 in Table 5
     :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017)
     :param v_max: the highest return, > ``v_min``; 10 for rewards clipped to [-1, 1]
+    :param spread_init: spread s > 0 of the returns that an untrained head predicts: p(z) is proportional to
+        1 / (1 + (z / s)²), a Cauchy distribution around 0, or around the return nearest to 0. ``None``: all returns are about
+        equally likely, as in C51, and priorities then hardly depend on rewards (docs/gradients.md)
     :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
     :raises ValueError: if an argument is out of range
     """
@@ -90,14 +93,16 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         n_atoms: int = 51,
         v_min: float = -10.0,
         v_max: float = 10.0,
+        spread_init: float | None = 1.0,
         **kwargs: Any,
     ):
-        check_arguments({"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max}, POLICY)
+        check_arguments({"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max, "spread_init": spread_init}, POLICY)
         if v_min >= v_max:
             raise ValueError(f"v_min must be a finite number < v_max = {v_max}, got {v_min}. Pass the lowest possible return.")
         self.n_atoms = n_atoms
         self.v_min = v_min
         self.v_max = v_max
+        self.spread_init = spread_init
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     @property
@@ -113,11 +118,16 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         return {**super().description, "support": f"[{float(self.v_min)}, {float(self.v_max)}]"}
 
     def make_q_net(self) -> EqRCategoricalNetwork:
-        return self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)
+        network = self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)
+        if self.spread_init is not None:
+            centre = network.support[network.support.abs().argmin()]
+            network.head.shift(-((network.support - centre) / self.spread_init).square().log1p())  # Cauchy, up to a constant
+        return network
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        return {**data, "n_atoms": self.n_atoms, "v_min": self.v_min, "v_max": self.v_max}
+        support = {"n_atoms": self.n_atoms, "v_min": self.v_min, "v_max": self.v_max}
+        return {**data, **support, "spread_init": self.spread_init}
 
 
 MlpPolicy = EqRRainbowPolicy

@@ -183,6 +183,16 @@ class DistributionalHead(nn.Module):
         value = self.value(of_value, noise)[:, :, None]  # (B, N, 1)
         return value + advantage - advantage.mean(dim=2, keepdim=True)
 
+    @th.no_grad()
+    def shift(self, outputs: th.Tensor) -> None:
+        """
+        Add to the biases of the last layer, so that the outputs for every action change by the same numbers.
+
+        :param outputs: (N,)
+        """
+        last: Any = (self.advantage if self.value is None else self.value)[-1]
+        last.bias += outputs.repeat_interleave(len(last.bias) // self.n_atoms)  # (N * A,) or (N,)
+
     def project(self, features: th.Tensor) -> th.Tensor:
         """
         The projection p of the AET loss: the first layer of each stream, before the activation, without noise (appendix B.4).
