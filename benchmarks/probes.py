@@ -18,11 +18,9 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
-from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.trials import WORLDS, merged
-from sb3_eqr import EqRQRDQN, EqRRainbow, envs
-from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from benchmarks.trials import WORLDS, make_agent
+from sb3_eqr import EqRRainbow, envs
 from sb3_eqr.visualize.latents import encode
 
 # MinAtar's planes (Young and Tian 2019); targets are the mean position and the number of lit pixels per plane.
@@ -148,7 +146,7 @@ def main() -> None:
     """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--game", choices=[*PLANES, *MEMORY, *WORLDS], default="Breakout")
-    parser.add_argument("--agent", default="eqr_rainbow", help="a file of zoo_hyperparams")
+    parser.add_argument("--agent", help="a file of zoo_hyperparams (default: eqr_rainbow; eqr_qrdqn where states are known)")
     parser.add_argument("--changes", type=yaml.safe_load, default={}, help="changes of its entry, as YAML")
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
@@ -159,22 +157,10 @@ def main() -> None:
     if args.models:
         probe_saved(args.game, args.models)
         return
-    is_atari = args.game in MEMORY
-    env_id, env_kwargs = WORLDS.get(args.game, ("atari" if is_atari else f"MinAtar/{args.game}-v1", {}))
-    settings = {**args.changes}
-    if args.game not in WORLDS:
-        entry = yaml.safe_load(configuration_files()[args.agent].read_text(encoding="utf-8"))[env_id]
-        settings = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, settings)
-    settings["buffer_size"] = max(args.steps, 100)
+    agent = args.agent or ("eqr_qrdqn" if args.game in WORLDS else "eqr_rainbow")
     for seed in args.seeds:
-        if is_atari:
-            env = envs.make_atari100k_env(args.game.removeprefix("ALE/"), n_envs=1, seed=seed)
-        else:
-            wrapper = None if args.game in WORLDS else envs.minatar.ChannelsFirstImage
-            env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs, wrapper_class=wrapper)
-        kind = EqRQRDQN if args.game in WORLDS else EqRRainbow
-        model = kind("CnnPolicy", env, seed=seed, device="cpu", **settings)
-        env = model.get_env() or env  # channels first
+        model = make_agent(agent, args.game, seed, {**args.changes, "buffer_size": max(args.steps, 100)})
+        env = model.get_env()  # channels first
         found = {"new": probe(model, frames(model, env, args.game, seed))}
         if args.steps:
             model.learn(args.steps)

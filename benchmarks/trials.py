@@ -44,19 +44,16 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     :return: the results for its row
     """
     import torch as th
-    from sb3_contrib import QRDQN
-    from stable_baselines3 import DQN
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.logger import KVWriter, Logger
 
     from benchmarks.probes import probe, scattered
-    from sb3_eqr import EqRQRDQN, EqRRainbow, envs
+    from sb3_eqr import envs
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
     from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
     from sb3_eqr.common.latent_model import GroupLatentModel
-    from sb3_eqr.configurations import ZOO_KEYS, configuration_files
     from sb3_eqr.visualize.diagnostics import diagnose
     from sb3_eqr.visualize.latents import replayed
 
@@ -75,18 +72,8 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
 
     th.set_num_threads(1)
     envs.register()
-    agent = trial["agent"]
-    kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN, "qrdqn": EqRQRDQN}
-    arguments = {"buffer_size": steps, **trial.get("changes", {})}
-    if game in WORLDS:
-        env_id, env_kwargs = WORLDS[game]
-        env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
-    else:
-        protocol = choose(load_suite("minatar"), [game], steps).protocol(game)
-        env = make_vec_env(protocol["env_id"], seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
-        entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[protocol["env_id"]]
-        arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, arguments)
-    model: Any = kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **arguments)
+    model = make_agent(trial["agent"], game, seed, {"buffer_size": steps, **trial.get("changes", {})})
+    env = model.get_env()
     means = Means()
     model.set_logger(Logger(folder=None, output_formats=[means]))
     started = time.monotonic()
@@ -94,6 +81,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     seconds = time.monotonic() - started
     goals: dict[str, Any] = {}
     if game in WORLDS:
+        env_id, env_kwargs = WORLDS[game]
         goals = rewards_found(env, steps)
         if isinstance(model, EqRAlgorithm):
             found_by_probes = probe(model, scattered(env_id, env_kwargs))["trunk"]
@@ -101,7 +89,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         games = model._wrap_env(make_vec_env(env_id, 10, seed + 1_000, env_kwargs=env_kwargs), monitor_wrapper=False)
         scores, _ = evaluate_policy(model, games, 100, return_episode_rewards=True)
     else:
-        scores, _ = evaluate(model, protocol, 100, seed)
+        scores, _ = evaluate(model, choose(load_suite("minatar"), [game], steps).protocol(game), 100, seed)
     skill = {}
     if getattr(model, "depth", 0) and isinstance(model.policy.latent_model, GroupLatentModel):
         found = diagnose(model, replayed(model, 512, np.random.default_rng(seed)), seed)
@@ -116,6 +104,36 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
         **goals,
         "train": {key.removeprefix("train/"): float(f"{value:.4g}") for key, value in logged.items()},
     }
+
+
+def make_agent(agent: str, game: str, seed: int, changes: dict[str, Any]) -> Any:
+    """
+    :param agent: a file of zoo_hyperparams
+    :param game: a game of MinAtar or Atari ("ALE/Pong") with the entry of that file, or a key of ``WORLDS``, without an entry
+    :param changes: arguments that differ from the entry
+    :return: an untrained agent
+    """
+    from sb3_contrib import QRDQN
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from sb3_eqr import EqRQRDQN, EqRRainbow, envs
+    from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+
+    kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN, "qrdqn": EqRQRDQN}
+    arguments = dict(changes)
+    if game in WORLDS:
+        env_id, env_kwargs = WORLDS[game]
+        env: Any = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
+    else:
+        if game.startswith("ALE/"):
+            name, env = "atari", envs.make_atari100k_env(game.removeprefix("ALE/"), n_envs=1, seed=seed)
+        else:
+            name = f"MinAtar/{game}-v1"
+            env = make_vec_env(name, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
+        entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[name]
+        arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, arguments)
+    return kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **arguments)
 
 
 def rewards_found(env: Any, steps: int) -> dict[str, Any]:
