@@ -25,7 +25,7 @@ from sb3_eqr.representation import train_representation
 GOALS = {"A": [0.25, 0.25], "B": [0.75, 0.5]}
 N_STEPS = 8  # around the torus, along each axis: 64 positions
 STATES: dict[str, Any] = {"group": "SO(2)", "n_blocks": 2, "parameterization": "gram-schmidt", "whiten": True}
-STATES["state_dependent_actions"] = False
+STATES |= {"state_dependent_actions": False, "head_input": "state", "layer_norm": False}  # as in train_representation
 ARMS = ("scratch", "transferred", "transferred, frozen", "without a goal, frozen")
 EVAL_EPISODES = 25
 
@@ -64,13 +64,8 @@ def run(goal: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[s
     elif arm.startswith("without"):
         donor = out / f"none-{seed}.zip"
         if not donor.exists():
-            states = dict(STATES)
             train_representation(
-                make_env(None, 16, seed),
-                states.pop("group"),
-                states.pop("n_blocks"),
-                state_dependent_actions=states.pop("state_dependent_actions"),
-                seed=seed,
+                make_env(None, 16, seed), STATES["group"], STATES["n_blocks"], state_dependent_actions=False, seed=seed
             ).save(donor)
         model.load_representation(donor, freeze=True)
     evaluation = make_env(goal, 5, seed + 1_000)

@@ -13,13 +13,13 @@ from sb3_eqr.eqr_rainbow.policies import CnnPolicy, EqRCategoricalNetwork, EqRRa
 
 class EqRRainbow(EqRAlgorithm, DQN):
     """
-    Equivariant representations for RL (EqR) on a Rainbow-style categorical agent: the agent of the paper.
+    Equivariant representations for RL (EqR) on a Rainbow-style categorical agent, as in the paper.
     Paper: Mondal et al., EqR: Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022);
     the categorical head (C51) is from https://arxiv.org/abs/1707.06887, its combination with double Q, dueling, noisy
     layers, prioritised replay and n-step returns from https://arxiv.org/abs/1710.02298.
 
     The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRRainbow.__init__)``). The
-    defaults are the paper's values for Atari 100K (Table 5).
+    defaults are the paper's values for Atari 100K (Table 5), except for those of docs/gradients.md, "What helps".
 
     ``policy_kwargs`` sets the support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), the group, the number
     of blocks, dueling and noisy layers, see :class:`~sb3_eqr.eqr_rainbow.policies.EqRRainbowPolicy`. The default support
