@@ -27,7 +27,7 @@ class CapturedGradients:
 
     :param objective: a function of samples and coefficients; its result has the scalar ``loss``, which is minimised
     :param policy: the networks that it evaluates
-    :param parameters: the trained parameters; their ``grad`` must be ``None`` at each call
+    :param parameters: the trained parameters; each call overwrites their ``grad``
     """
 
     WARM_UP = 3  # eager calls before the capture

@@ -134,7 +134,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param td_coef: weight of the TD loss, ≥ 0; 0: train only the representation, without Q-learning and with constant
             priorities
         :param aux_gradient_share: maximum norm of the auxiliary losses' gradient at the features, as a share of the TD
-            gradient's norm, ≥ 0; a larger gradient is scaled down. ``None``: no limit
+            gradient's norm, ≥ 0; a larger gradient is scaled down. ``None``: no limit. Without effect if td_coef=0, and on
+            the first layer of the Q head, which the AET loss trains with projection="head"
         :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
         :param prioritized_replay: whether to sample by priority and weight all losses (Schaul et al. 2016), or uniformly
         :param shift_pixels: random shift of images, in pixels; 0 disables it
@@ -218,7 +219,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         self.policy = self._make_policy()
-        self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
+        self._check_losses_of_policy()
         saved, self.policy_description = self.policy_description, self.policy.description
         validation.check_same_parameters(self.policy_description, saved)
         self._convert_train_freq()
@@ -229,10 +230,13 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
-        options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share
-        self.objective = Objective(self.policy, *options)
-        self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
+        self._set_up_objective()
         keep_freed_memory()
+
+    def _set_up_objective(self) -> None:
+        self._options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph
+        self.objective = Objective(self.policy, *self._options[:-1])
+        self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)
@@ -243,14 +247,23 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
         chosen, given = self.replay_buffer_class, self.replay_buffer_kwargs
         validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
-        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
-        validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        self._check_losses()
         noisy = self.policy_kwargs.get("noisy", True)
-        if self.exploration_final_eps == 0 and not noisy and self.resets.interval is None:  # resets also cause exploration
+        if (
+            self.exploration_final_eps == 0 and not noisy and self._resets.schedule.interval is None
+        ):  # resets also cause exploration
             warnings.warn(
                 "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
                 "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
             )
+
+    def _check_losses(self) -> None:
+        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
+        validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        validation.check_whitening(self.policy_kwargs.get("whiten", False), self.batch_size)
+
+    def _check_losses_of_policy(self) -> None:
+        self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
 
     @property
     def depth(self) -> int:
@@ -291,6 +304,10 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
+        self._check_losses()
+        self._check_losses_of_policy()
+        if self._options != (self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph):
+            self._set_up_objective()
         result = super()._setup_learn(*args, **kwargs)
         if self.learning_starts is None:
             self.learning_starts = min(self._total_timesteps // 10, MAX_LEARNING_STARTS)
@@ -444,4 +461,4 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._log_last_round(check_model=True)  # rolls back instead of saving a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "objective", "_captured"]
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "_options", "objective", "_captured"]

@@ -91,10 +91,11 @@ class Objective:
         """The loss terms of B windows; without a rollout (M = 0) there are no auxiliary losses."""
         observations = self.augment(samples.observations)
         features = self.policy.online.features_extractor(observations)
-        # (B, F): TD and auxiliary losses share only these features, so their gradients are balanced here.
+        # (B, F): TD and auxiliary losses share these features, so their gradients are balanced here. With projection="head"
+        # they also share the first layer of the Q head, whose gradients are not.
         for_head = for_state = features
         gram = None
-        if coefs.td > 0 and samples.mask is not None:
+        if coefs.td > 0 and samples.mask is not None and features.requires_grad:  # not if the representation is frozen
             gram = features.new_zeros(2, 2)
             for_head, for_state = branch(features, self.aux_gradient_share, gram)
         state = for_state if samples.mask is None else self.policy.latent_model.embedding(for_state)  # x₀, (B, D)

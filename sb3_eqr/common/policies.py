@@ -79,7 +79,8 @@ class EqRPolicy(BasePolicy):
     :param noisy: whether to use factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243); Table 5 uses 0.5
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
-        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None`` and an image trunk
+        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
+        and ``layer_norm=False``, since it predicts values in [0, 1]
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
     :param latent_norm: norm of these layers: "layer", or "batch" (appendix B.4), with which an unusual state in a batch
         changes the predictions for all others (docs/gradients.md)
@@ -156,6 +157,11 @@ class EqRPolicy(BasePolicy):
             raise ValueError("group must not be None if whiten=True, got None. Pass a group, or whiten=False.")
         if transition == "convolutional" and group is not None:
             raise ValueError(f'group must be None if transition="convolutional", got {group!r}. Pass group=None.')
+        if transition == "convolutional" and layer_norm:
+            raise ValueError(
+                'layer_norm must be False if transition="convolutional", which predicts values in [0, 1], got True. Pass '
+                'policy_kwargs={"layer_norm": False, "features_extractor_kwargs": {"rescale": True}}.'
+            )
         self.group = group
         self.n_blocks = n_blocks
         self.parameterization = parameterization
@@ -346,9 +352,8 @@ class EqRPolicy(BasePolicy):
     def check_losses(self, aet: bool, symmetry: bool) -> None:
         """Raise ValueError if this policy does not support the requested AET or GET (``symmetry``) loss."""
         if symmetry and not self.latent_model.has_symmetry_loss:
-            raise ValueError(
-                f"group must have inverses for the GET loss, got {self.group!r}. Pass symmetry_coef=0 or another group."
-            )
+            remedy = "Pass symmetry_coef=0" + (" or another group." if self.transition == "group" else ".")
+            raise ValueError(f"group must have inverses for the GET loss, got {self.group!r}. {remedy}")
         if aet and self.projection == "head" and isinstance(self.latent_model.embedding, GroupLayer):
             raise ValueError(
                 'projection must be "own" or "none" if head_input="trunk", because the Q head then takes no group elements, '
@@ -391,11 +396,11 @@ class EqRPolicy(BasePolicy):
 
     def reset_parameters(self, fresh: "EqRPolicy", shrink_factor: float) -> None:
         """
-        Reset parameters to counter the loss of plasticity: reinitialise the Q head and the AET loss's own projection
-        (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802), and set encoder and latent model to α old + (1 - α) fresh
-        (shrink and perturb, Ash and Adams 2020, https://arxiv.org/abs/1910.08475; used for the encoder in SR-SPR and BBF).
-        Batch statistics and frozen parameters are kept. The optimiser's state is cleared, and the target copies the new
-        parameters.
+        Reset parameters to counter the loss of plasticity: reinitialise the Q head and the AET loss's own projection and
+        predictor (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802), and set encoder and latent model to α old +
+        (1 - α) fresh (shrink and perturb, Ash and Adams 2020, https://arxiv.org/abs/1910.08475; used for the encoder in
+        SR-SPR and BBF). Batch statistics and frozen parameters are kept. The optimiser's state is cleared, and the target
+        copies the new parameters.
 
         :param fresh: a newly initialised policy of the same kind
         :param shrink_factor: α in [0, 1]

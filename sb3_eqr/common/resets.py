@@ -12,9 +12,10 @@ class ResetSchedule:
     """
     When an agent is reset, and how n and γ are annealed; by default neither.
 
-    A reset reinitialises the Q head (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802), shrinks and perturbs encoder and
-    latent model, and clears the optimiser's state (SR-SPR, D'Oro et al. 2023, https://openreview.net/forum?id=OpC-9aBBVJe;
-    BBF, Schwarzer et al. 2023, https://arxiv.org/abs/2305.19452).
+    A reset reinitialises the Q head and the AET loss's own projection and predictor (Nikishin et al. 2022,
+    https://arxiv.org/abs/2205.07802), shrinks and perturbs encoder and latent model, and clears the optimiser's state
+    (SR-SPR, D'Oro et al. 2023, https://openreview.net/forum?id=OpC-9aBBVJe; BBF, Schwarzer et al. 2023,
+    https://arxiv.org/abs/2305.19452).
 
     :param interval: gradient steps between two resets, ≥ 1; 40,000 in BBF. ``None``: no resets
     :param shrink_factor: α in [0, 1]: encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF

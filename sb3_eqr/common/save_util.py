@@ -257,6 +257,9 @@ class SafeFiles(OffPolicyAlgorithm):
                 "Load files that were saved together."
             )
         loaded.device = self.device
+        for name in ("initial_beta", "final_beta"):  # arguments of the model; nothing that is stored depends on them
+            if hasattr(before, name):
+                setattr(loaded, name, getattr(before, name))
         self.replay_buffer = loaded
 
     def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:

@@ -36,8 +36,8 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
                 raise ValueError(
                     f"load_representation: {name}.{key} must be the same in both agents, got {expected.get(key, 'missing')} "
                     f"here and {given.get(key, 'missing')} in the file. Build this agent with the policy_kwargs of the saved "
-                    "agent (head_input, group, n_blocks, parameterization, whiten, layer_norm, trunk, latent_hidden_dim, "
-                    "latent_norm, state_dependent_actions), for the same observations and actions."
+                    "agent (head_input, group, n_blocks, parameterization, whiten, layer_norm, center, trunk, transition, "
+                    "latent_hidden_dim, latent_norm, state_dependent_actions), for the same observations and actions."
                 )
     for name, module in modules.items():
         module.load_state_dict(found[name])
@@ -52,7 +52,8 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
 
 def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
     """The encoder and the components of the latent model that do not depend on rewards, by name."""
-    return {ENCODER: policy.online.features_extractor} | {name: getattr(policy.latent_model, name) for name in LATENT_PARTS}
+    parts = {name: getattr(policy.latent_model, name, None) for name in LATENT_PARTS}  # SPR's transition has no ρ
+    return {ENCODER: policy.online.features_extractor} | {name: part for name, part in parts.items() if part is not None}
 
 
 def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device) -> dict[str, dict[str, th.Tensor]]:

@@ -218,6 +218,14 @@ def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, init
         )
 
 
+def check_whitening(whiten: bool, batch_size: int) -> None:
+    """Raise ValueError if latent states are to be whitened in batches of one, which have no covariance."""
+    if whiten and batch_size < 2:
+        raise ValueError(
+            f"batch_size must be an integer >= 2 for whiten=True, got {batch_size}. Pass a larger batch_size, or whiten=False."
+        )
+
+
 def warn_of_idle_training(last_step: int, learning_starts: int, n_updates: int, buffer: Any) -> None:
     """Warn if a call of ``learn`` makes no updates, or if a trained agent has no replay buffer."""
     if learning_starts >= last_step > 0:

@@ -5,6 +5,7 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
 from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
@@ -12,7 +13,7 @@ from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.eqr_qrdqn import EqRQRDQNPolicy
 from sb3_eqr.eqr_rainbow import EqRRainbowPolicy
-from tests.toys import ChainEnv
+from tests.toys import ChainEnv, ImageEnv
 
 NOT_IN_A_TABLE = {
     # the algorithm: checked by SB3 or by sb3_eqr.common.validation, which know the context
@@ -86,6 +87,38 @@ def test_attributes_set_later_are_checked_when_learning_starts(name):
     with pytest.raises(ValueError, match=f"{name} must be .*, got -1"):
         model.learn(20)
     assert model.num_timesteps == 0
+
+
+def test_combinations_of_attributes_set_later_are_checked_when_learning_starts():
+    model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=10)
+    model.td_coef, model.prediction_depth = 0.0, 0
+    with pytest.raises(ValueError, match="td_coef must be > 0 if all auxiliary losses are disabled"):
+        model.learn(20)
+    model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, symmetry_coef=0.0, policy_kwargs={"group": "none(8)"})
+    model.symmetry_coef = 1.0
+    with pytest.raises(ValueError, match="group must have inverses for the GET loss"):
+        model.learn(20)
+    with pytest.raises(ValueError, match="batch_size must be an integer >= 2 for whiten=True, got 1"):
+        EqRRainbow("MlpPolicy", ChainEnv(), batch_size=1, prediction_depth=0, policy_kwargs={"whiten": True})
+
+
+@pytest.mark.parametrize("name, value", [("aux_gradient_share", 0.5), ("double_q", False), ("intensity_scale", 0.1)])
+def test_an_attribute_set_later_has_the_effect_of_the_argument(name, value):
+    def train(**given):
+        model = EqRRainbow("CnnPolicy", ImageEnv(), buffer_size=200, learning_starts=20, batch_size=8, seed=0, **given)
+        if not given:
+            setattr(model, name, value)
+        return model.learn(24).policy.state_dict()
+
+    given, later = train(**{name: value}), train()
+    assert all(th.equal(given[key], later[key]) for key in given)
+
+
+def test_resets_set_later():
+    model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=20, batch_size=8)
+    model.resets = {"interval": 10}
+    model.learn(80)
+    assert model.resets == ResetSchedule(interval=10) and model._resets.done
 
 
 def test_rules_by_hand():

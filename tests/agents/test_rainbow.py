@@ -293,7 +293,7 @@ def wait_for_a_longer_window(make):
     """A reset after 4 updates raises n from 2 to 60, while the buffer has about 45 transitions."""
     model = make(ChainEnv(), n_steps=2, resets={"interval": 4, "annealing_steps": 1}).learn(42)
     assert model._n_updates == 4
-    model._resets.schedule = replace(model._resets.schedule, initial_n_steps=60)
+    model.resets = replace(model.resets, initial_n_steps=60)
     return model
 
 

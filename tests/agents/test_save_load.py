@@ -185,6 +185,15 @@ def test_a_custom_group_is_saved(make, tmp_path):
     assert str(loaded.policy.latent_model.group) == str(group)
 
 
+def test_a_loaded_replay_buffer_keeps_the_models_beta(make, tmp_path):
+    make(ChainEnv()).learn(46).save_replay_buffer(tmp_path / "buffer")
+    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.9, "final_beta": 0.8})
+    with pytest.warns(UserWarning, match="saved at step 46"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(60)
+    assert model.replay_buffer.beta == pytest.approx(0.8, abs=0.02)
+
+
 def test_a_loaded_replay_buffer_replaces_the_models(make, tmp_path):
     model = make(ChainEnv()).learn(46)
     model.save_replay_buffer(tmp_path / "buffer")

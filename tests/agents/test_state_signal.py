@@ -145,7 +145,7 @@ def test_a_new_predictor_changes_nothing():
     """As the identity, except with SPR's own transition, which has PyTorch's weights."""
     policy, rows = EqRRainbow("MlpPolicy", ChainEnv(), seed=0).policy, th.randn(5, 72)
     th.testing.assert_close(policy.project(rows), policy.target_project(rows))
-    spr = {"group": None, "transition": "convolutional", "projection": "none", "predictor": True}
+    spr = {"group": None, "transition": "convolutional", "projection": "none", "predictor": True, "layer_norm": False}
     spr |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]]}}
     policy = EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, seed=0, policy_kwargs=spr).policy
     assert policy.predictor_net.weight.diagonal().abs().max() < 0.5
@@ -153,7 +153,7 @@ def test_a_new_predictor_changes_nothing():
 
 def test_spr_trains_saves_and_loads(tmp_path):
     settings = {**SETTINGS, "aet_coef": 5.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
-    policy_kwargs = {"group": None, "transition": "convolutional", "predictor": True, "latent_tau": 1.0}
+    policy_kwargs = {"group": None, "transition": "convolutional", "predictor": True, "latent_tau": 1.0, "layer_norm": False}
     policy_kwargs |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]], "rescale": True}}
     model = EqRRainbow("CnnPolicy", ImageEnv(), **settings, policy_kwargs=policy_kwargs)
     before = [p.clone() for p in model.policy.latent_model.transition.parameters()]
@@ -163,15 +163,22 @@ def test_spr_trains_saves_and_loads(tmp_path):
     loaded = EqRRainbow.load(tmp_path / "spr")
     observation = model.env.reset()
     assert (loaded.predict(observation, deterministic=True)[0] == model.predict(observation, deterministic=True)[0]).all()
+    other = EqRRainbow("CnnPolicy", ImageEnv(), **settings, policy_kwargs=policy_kwargs)
+    other.load_representation(tmp_path / "spr", freeze=True)
+    parts = [dict(one.policy.latent_model.transition.state_dict()) for one in (model, other)]
+    assert all(th.equal(parts[0][key], parts[1][key]) for key in parts[0])
 
 
 def test_a_convolutional_transition_needs_a_feature_map():
+    spr = {"transition": "convolutional", "group": None, "layer_norm": False}
     with pytest.raises(ValueError, match=r"group must be None if transition"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional"})
     with pytest.raises(ValueError, match=r"must be an image trunk.*got MlpExtractor"):
-        EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs={"transition": "convolutional", "group": None})
-    with pytest.raises(ValueError, match=r"group must have inverses for the GET loss"):
-        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional", "group": None})
+        EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs=spr)
+    with pytest.raises(ValueError, match=r"group must have inverses for the GET loss, got None. Pass symmetry_coef=0\.$"):
+        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs=spr)
+    with pytest.raises(ValueError, match=r"layer_norm must be False if transition"):
+        EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, policy_kwargs={**spr, "layer_norm": True})
     with pytest.raises(ValueError, match=r"transition must be one of"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"transition": "linear"})
 

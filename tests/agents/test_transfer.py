@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.transfer import representation
-from tests.models import BOTH, MAKERS
+from tests.models import BOTH, MAKERS, loss_terms
 from tests.toys import ChainEnv
 
 QRDQN, RAINBOW = MAKERS
@@ -57,6 +57,9 @@ def test_frozen_networks_survive_training_saving_and_resets(make, tmp_path):
     model.learn(46)
     assert same(before, states(model)) and not th.equal(head, model.policy.online.head.advantage[0].weight)
     model.save(tmp_path / "new")
+    assert not any(
+        "state_gradient" in name for name in loss_terms(model, model.replay_buffer.sample(8)).metrics()
+    )  # none to log
     loaded = make.algorithm.load(tmp_path / "new", env=ChainEnv())
     loaded.learn(46)
     assert same(before, states(loaded)) and loaded._resets.done  # a reset does not change it either

@@ -171,11 +171,13 @@ def test_the_running_mean_by_hand():
         layer.running_mean.copy_(th.tensor(start))
         for _ in range(2):  # a call does not change what the next one of the same update subtracts
             np.testing.assert_allclose(layer(batch), batch - th.tensor(start), atol=1e-12)
-        layer(batch[:1])  # neither noted
         with th.no_grad():
-            layer(th.randn(5, 2, dtype=th.float64))  # such as encodings for the target
+            layer(th.randn(5, 2, dtype=th.float64))  # not noted, such as encodings for the target
         layer.update()
         np.testing.assert_allclose(layer.running_mean, expected, atol=1e-12)
+    layer(batch[:1])  # one observation does not move it
+    layer.update()
+    np.testing.assert_allclose(layer.running_mean, expected, atol=1e-12)
     layer.eval()
     layer(10 * batch)
     layer.update()

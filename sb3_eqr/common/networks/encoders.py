@@ -330,7 +330,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param parameterization: parameterization of rotations
     :param whiten: whether to whiten the algebra parameters over the batch
     :param layer_norm: whether to apply layer norm to the trunk's features
-    :param center: whether to subtract their running mean before the layer norm; unused without layer norm
+    :param center: whether to subtract their running mean before the layer norm; unused without layer norm. The agents of this
+        package update that mean after each gradient step (``Centering.update``); others, such as SB3's, do not
     :param trunk_class: features extractor before the linear layer, or its name in ``TRUNKS``; ``None``: the
         paper's convolutions for images, SB3's extractors otherwise
     :param trunk_kwargs: its keyword arguments

@@ -1,4 +1,4 @@
-"""Layers that PyTorch lacks: noisy linear layers, the distributional head, whitening."""
+"""Layers that PyTorch lacks: noisy linear layers, the distributional head, centring, whitening."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -246,6 +246,8 @@ class Centering(nn.Module):
             mean = features.mean(dim=0)
             self.note(features.detach())
             features = features - (mean - mean.detach())  # subtracts 0; the gradient loses its mean
+        elif self.training and th.is_grad_enabled():
+            self.batch_mean.copy_(self.running_mean)  # update then moves nothing
         return features - self.running_mean
 
     def note(self, features: th.Tensor) -> None:

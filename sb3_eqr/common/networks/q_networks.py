@@ -18,7 +18,7 @@ class EqRNetwork(BasePolicy):
 
     :param observation_space: Observation space
     :param action_space: Action space
-    :param features_extractor: the group encoder
+    :param features_extractor: the trunk, or the group encoder with ``head_input="state"``
     :param head: the Q head, which takes its features
     :param normalize_images: Whether to divide images by 255
     """
