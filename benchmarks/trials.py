@@ -118,7 +118,7 @@ def make_agent(agent: str, game: str, seed: int, changes: dict[str, Any]) -> Any
     from stable_baselines3.common.env_util import make_vec_env
 
     from sb3_eqr import EqRQRDQN, EqRRainbow, envs
-    from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+    from sb3_eqr.configurations import ZOO_KEYS, configuration_files, with_schedule
 
     kinds = {"stock/qrdqn": QRDQN, "stock/dqn": DQN, "eqr_qrdqn": EqRQRDQN, "qrdqn": EqRQRDQN}
     arguments = dict(changes)
@@ -133,7 +133,7 @@ def make_agent(agent: str, game: str, seed: int, changes: dict[str, Any]) -> Any
             env = make_vec_env(name, seed=seed, wrapper_class=envs.minatar.ChannelsFirstImage)
         entry = yaml.safe_load(configuration_files()[agent].read_text(encoding="utf-8"))[name]
         arguments = merged({key: value for key, value in entry.items() if key not in ZOO_KEYS}, arguments)
-    return kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **arguments)
+    return kinds.get(agent, EqRRainbow)("CnnPolicy", env, seed=seed, device="cpu", **with_schedule(arguments))
 
 
 def rewards_found(env: Any, steps: int) -> dict[str, Any]:

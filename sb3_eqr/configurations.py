@@ -49,9 +49,18 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
             f"configuration {name!r}, {env_id!r}: policy_kwargs must be a dictionary, got Python code, which only RL Zoo "
             f"evaluates. Use sb3-eqr train --conf-file {name}, or pass the arguments to the constructor yourself."
         )
-    if isinstance(arguments.get("learning_rate"), str):  # RL Zoo's lin_1e-3: linearly from 1e-3 to 0
-        arguments["learning_rate"] = LinearSchedule(float(arguments["learning_rate"].removeprefix("lin_")), 0.0, 1.0)
-    return _merged(arguments, changes)
+    return with_schedule(_merged(arguments, changes))
+
+
+def with_schedule(arguments: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param arguments: of an agent; a ``learning_rate`` such as "lin_1e-3" is RL Zoo's for one that falls linearly from 1e-3 to 0
+    :return: the same, with the schedule that such a text names
+    """
+    rate = arguments.get("learning_rate")
+    if isinstance(rate, str):
+        return {**arguments, "learning_rate": LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)}
+    return arguments
 
 
 def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
