@@ -54,7 +54,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
 
 def with_schedule(arguments: dict[str, Any]) -> dict[str, Any]:
     """
-    :param arguments: of an agent; a ``learning_rate`` such as "lin_1e-3" is RL Zoo's for one that falls linearly from 1e-3 to 0
+    :param arguments: of an agent; a ``learning_rate`` such as "lin_1e-3" is RL Zoo's for a linear fall from 1e-3 to 0
     :return: the same, with the schedule that such a text names
     """
     rate = arguments.get("learning_rate")
