@@ -11,6 +11,7 @@ import argparse
 import json
 import lzma
 import pathlib
+import re
 from typing import Any
 
 from sb3_eqr.benchmark.runs import PLAN, RESULT, write_json, write_plan
@@ -18,6 +19,7 @@ from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.common.files import atomic_write
 
 PLANNED = "agent game seed suite protocol entry command".split()  # the fields of a run's plan, which its result repeats
+ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
 
 
 def read(file: pathlib.Path) -> dict[str, dict[str, Any]]:
@@ -29,6 +31,8 @@ def read(file: pathlib.Path) -> dict[str, dict[str, Any]]:
 
 def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
     """
+    Keeps only the last part of absolute paths, since the folders above it are those of one machine.
+
     :param folder: folder of a benchmark
     :param file: the file, which keeps rows of runs that are not in the folder
     :return: number of rows in the file
@@ -36,7 +40,7 @@ def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
     rows = read(file) if file.exists() else {}
     for path in folder.glob(f"runs/*/*/*/{RESULT}"):
         rows[str(path.parent.relative_to(folder / "runs"))] = json.loads(path.read_text(encoding="utf-8"))
-    lines = [json.dumps({"folder": name, "result": rows[name]}) + "\n" for name in sorted(rows)]
+    lines = [ABSOLUTE.sub("", json.dumps({"folder": name, "result": rows[name]})) + "\n" for name in sorted(rows)]
     with atomic_write(file, "file") as out:
         out.write(lzma.compress("".join(lines).encode()))
     return len(rows)

@@ -366,13 +366,14 @@ def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
 
 
 def test_packed_runs_come_back(tmp_path):
-    """In two parts, of which the file keeps both, with the suite that a report needs, and without an unfinished run."""
+    """In two parts, which the file keeps, with the suite that a report needs, without unfinished runs and machines' folders."""
     file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
-    plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}, "command": "run"}
+    plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}}
+    plan["command"] = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml"
     for seed in (0, 1):
         path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Boxing" / str(seed) / RESULT
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(plan | {"seed": seed, "evaluations": [{"scores": [0.5]}]}))
+        path.write_text(json.dumps(plan | {"seed": seed, "evaluations": [{"scores": [0.5]}]}).replace("TOP", "/a/b-1"))
         assert packed_runs.pack(tmp_path / f"part{seed}", file) == seed + 1
     unfinished = tmp_path / "part2" / "runs" / "dqn" / "Boxing" / "2" / RESULT
     unfinished.parent.mkdir(parents=True)
@@ -381,6 +382,7 @@ def test_packed_runs_come_back(tmp_path):
     assert [packed_runs.unpack(back, file) for _ in range(2)] == [2, 0]
     found = load_results(back)
     assert [run["seed"] for run in found] == [0, 1] and found[1]["evaluations"] == [{"scores": [0.5]}]
-    assert json.loads((back / "runs/dqn/Boxing/1/run.json").read_text()) == plan | {"seed": 1}
+    command = "run here --agents dqn:a.yml dqn:settings/b.yml"
+    assert json.loads((back / "runs/dqn/Boxing/1/run.json").read_text()) == plan | {"seed": 1, "command": command}
     suite = read_suite(back / SUITE)
     assert (suite.name, suite.games, suite.steps) == ("atari100k-5", ["Boxing"], {"Boxing": 9})
