@@ -21,6 +21,7 @@ SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
 GAMES = ("torus_of_8",)
 NAMES = {
     "default": "EqR, the defaults",
+    "aet_5": "EqR, aet_coef=5",
     "contrastive": "contrastive AET loss",
     "distance": "AET loss without predictor",
     "no_group": "the defaults, no group",

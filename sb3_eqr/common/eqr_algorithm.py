@@ -80,7 +80,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         exploration_final_eps: float = 0.0,
         max_grad_norm: float | None = 10.0,
         prediction_depth: int = 5,
-        aet_coef: float = 5.0,
+        aet_coef: float = 1.0,
         symmetry_coef: float = 1.0,
         reward_coef: float = 5.0,
         td_coef: float = 1.0,

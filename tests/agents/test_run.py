@@ -134,7 +134,7 @@ def test_defaults_are_those_of_table_5(make):
     buffer = model.replay_buffer
     assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.4, 1.0)
     assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
-    assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (5, 1, 5)  # means over M = 5 steps
+    assert (model.aet_coef, model.symmetry_coef, model.reward_coef) == (1, 1, 5)  # means over M = 5 steps
     assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
     adam = model.policy.optimizer.defaults
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)

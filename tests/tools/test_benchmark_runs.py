@@ -366,7 +366,7 @@ def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
 
 
 def test_packed_runs_come_back(tmp_path):
-    """In two parts, which the file keeps, with the suite that a report needs, without unfinished runs and machines' folders."""
+    """In two parts, which the file keeps, with the suite, without unfinished runs and the machine's folders."""
     file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
     plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}}
     plan["command"] = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml"
