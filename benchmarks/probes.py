@@ -20,8 +20,8 @@ import torch as th
 import yaml
 
 from benchmarks.trials import WORLDS, make_agent
-from sb3_eqr import EqRRainbow, envs
-from sb3_eqr.visualize.latents import encode
+from sb3_eqr import EqRRainbow, GroupFeaturesExtractor, envs
+from sb3_eqr.visualize.latents import encode, eval_mode
 
 # MinAtar's planes (Young and Tian 2019); targets are the mean position and the number of lit pixels per plane.
 PLANES = {
@@ -90,16 +90,23 @@ def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
     return seen[order], {name: positions[order] for name, positions in known.items()}
 
 
+def trunk_features(model: Any, observations: th.Tensor) -> th.Tensor:
+    """:return: (N, F), what the trunk and its layer norm make of observations, without a group layer on top of them"""
+    network = model.policy.online
+    encoder = network.features_extractor
+    return network.extract_features(observations, encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder)
+
+
 def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
     """
     :return: what is probed -> object -> R²; the latent state only for agents with a group
     """
     seen, known = frames
-    with th.no_grad():
-        features = np.concatenate([model.policy.online.features(part).numpy() for part in th.as_tensor(seen).split(250)])
-    inputs = {"trunk": features}
-    if model.policy.latent_model is not None:
-        inputs["state"] = encode(model, th.as_tensor(seen)).cpu().numpy()
+    parts = th.as_tensor(seen).split(250)
+    with eval_mode(model), th.no_grad():
+        inputs = {"trunk": np.concatenate([trunk_features(model, part).cpu().numpy() for part in parts])}
+        if model.policy.group_layer is not None:
+            inputs["state"] = encode(model, th.as_tensor(seen)).cpu().numpy()
     return {what: {name: explained(x, y) for name, y in known.items()} for what, x in inputs.items()}
 
 
@@ -159,13 +166,13 @@ def main() -> None:
         return
     agent = args.agent or ("eqr_qrdqn" if args.game in WORLDS else "eqr_rainbow")
     for seed in args.seeds:
-        model = make_agent(agent, args.game, seed, {**args.changes, "buffer_size": max(args.steps, 100)})
-        env = model.get_env()  # channels first
-        found = {"new": probe(model, frames(model, env, args.game, seed))}
+        model, new = (
+            make_agent(agent, args.game, seed, {**args.changes, "buffer_size": max(args.steps, 100)}) for _ in range(2)
+        )
         if args.steps:
             model.learn(args.steps)
-            found["trained"] = probe(model, frames(model, env, args.game, seed))
-        print_table(f"seed {seed}", found)
+        seen = frames(model, model.get_env(), args.game, seed)
+        print_table(f"seed {seed}", {"new": probe(new, seen)} | ({"trained": probe(model, seen)} if args.steps else {}))
         print(json.dumps(args.changes), flush=True)
 
 

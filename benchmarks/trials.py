@@ -147,14 +147,45 @@ def rewards_found(env: Any, steps: int) -> dict[str, Any]:
 
 
 def merged(entry: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """An entry with changes, where dictionaries are merged, and "dict(...)" strings are evaluated as in RL Zoo."""
+    """
+    An entry with changes. Dictionaries are merged, except with an empty one, which replaces the entry's; "dict(...)" strings
+    are evaluated as in RL Zoo.
+    """
     result = {**entry, **changes}
     for key, old in entry.items():
         if isinstance(old, str) and old.startswith("dict("):
             old = eval(old, {"importlib": importlib})
-        if isinstance(old, dict):
+        if isinstance(old, dict) and (key not in changes or changes[key]):
             result[key] = merged(old, changes.get(key, {}))
     return result
+
+
+def content(trial: dict[str, Any]) -> str:
+    """:return: what a trial is, apart from its name, as text to compare"""
+    return json.dumps([trial["agent"], trial.get("changes", {})], sort_keys=True)
+
+
+def check_names(
+    rows: list[dict[str, Any]], trials: dict[str, dict[str, Any]], wanted: list[tuple[str, str, int]], steps: int
+) -> None:
+    """:raises SystemExit: if a file of rows has another trial of the same name, whose runs would count as those of this one"""
+    for name, game, _ in wanted:
+        others = [
+            r
+            for r in rows
+            if (r["trial"], r["game"], r["steps"]) == (name, game, steps) and content(r) != content(trials[name])
+        ]
+        if others:
+            raise SystemExit(
+                f"{name}, {game}, {steps} steps: --rows must have no runs of another trial with this name, got "
+                f"{content(others[0])} instead of {content(trials[name])}. Rename the trial, or choose another file of rows."
+            )
+
+
+def commit() -> str:
+    """:return: the commit of the working folder, with "+" if files differ from it; "unknown" outside a clone"""
+    found = subprocess.run(["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
 
 
 def read_rows(path: pathlib.Path) -> list[dict[str, Any]]:
@@ -171,18 +202,20 @@ def mean_and_error(values: list[float]) -> str:
 def table(rows: list[dict[str, Any]], names: list[str], games: list[str], steps: int) -> str:
     """
     A Markdown table with a row per trial. Per game: the greedy policy's score ± its standard error over seeds, followed by
-    the same for the mean return over the last tenth of training.
+    the same for ``rollout/ep_rew_mean``, averaged over the last tenth of the times that it was logged; then, if games differ
+    in it, the number of seeds.
     """
     lines = [f"| trial, {steps:,} steps | seeds | " + " | ".join(games) + " | seconds |", "|---" * (len(games) + 3) + "|"]
     for name in names:
         own = [row for row in rows if row["trial"] == name and row["steps"] == steps]
         cells = []
+        seeds = len({row["seed"] for row in own if row["game"] in games})
         for game in games:
             found = [row for row in own if row["game"] == game]
             measures = ([row["score"] for row in found], [row["curve"][-1] for row in found if row["curve"]])
-            cells.append(", ".join(map(mean_and_error, measures)) if found else "")
+            fewer = f" ({len(found)})" if len(found) != seeds else ""
+            cells.append(", ".join(map(mean_and_error, measures)) + fewer if found else "")
         if own:
-            seeds = len({row["seed"] for row in own})
             lines.append(
                 f"| {name} | {seeds} | " + " | ".join(cells) + f" | {np.median([row['seconds'] for row in own]):.0f} |"
             )
@@ -224,30 +257,36 @@ def main() -> None:
     arguments = parser.parse_args()
     trials = yaml.safe_load(arguments.trials.read_text(encoding="utf-8"))
     names = arguments.names or list(trials)
+    failed: list[tuple[str, str, int]] = []
     if arguments.one:
         name, game, seed = arguments.one
-        row = {"trial": name, "game": game, "seed": int(seed), "steps": arguments.steps, **trials[name]}
+        row = {"trial": name, "game": game, "seed": int(seed), "steps": arguments.steps, **trials[name], "commit": commit()}
         row |= run(trials[name], game, int(seed), arguments.steps)
         with open(arguments.rows, "a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         return
     if not arguments.table:
-        done = {(r["trial"], r["game"], r["seed"], r["steps"]) for r in read_rows(arguments.rows)}
+        rows = read_rows(arguments.rows)
+        done = {(r["trial"], r["game"], r["seed"], r["steps"]) for r in rows}
         wanted = [(name, game, seed) for seed in arguments.seeds for name in names for game in arguments.games]
+        check_names(rows, trials, wanted, arguments.steps)
         left = [key for key in wanted if (*key, arguments.steps) not in done]
         command = [sys.executable, "-m", "benchmarks.trials", str(arguments.trials), "--rows", str(arguments.rows)]
         command += ["--steps", str(arguments.steps), "--one"]
 
-        def start(key: tuple[str, str, int]) -> None:
-            subprocess.run([*command, *map(str, key)], check=False, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        def start(key: tuple[str, str, int]) -> bool:
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            return subprocess.run([*command, *map(str, key)], check=False, env=environment).returncode == 0
 
         with ThreadPoolExecutor(arguments.jobs) as pool:
-            list(pool.map(start, left))
+            failed = [key for key, succeeded in zip(left, pool.map(start, left), strict=True) if not succeeded]
     rows = read_rows(arguments.rows)
     print(table(rows, names, arguments.games, arguments.steps))
     for game in arguments.games:
         if "torus" in game:
             print(f"\n{game}\n", world_table(rows, names, game, arguments.steps), sep="\n")
+    if failed:
+        raise SystemExit(f"These runs failed, see their errors above: {', '.join(map(str, failed))}.")
 
 
 if __name__ == "__main__":

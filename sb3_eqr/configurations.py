@@ -56,11 +56,17 @@ def with_schedule(arguments: dict[str, Any]) -> dict[str, Any]:
     """
     :param arguments: of an agent; a ``learning_rate`` such as "lin_1e-3" is RL Zoo's for a linear fall from 1e-3 to 0
     :return: the same, with the schedule that such a text names
+    :raises ValueError: if ``learning_rate`` is another text
     """
     rate = arguments.get("learning_rate")
-    if isinstance(rate, str):
-        return {**arguments, "learning_rate": LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)}
-    return arguments
+    if not isinstance(rate, str):
+        return arguments
+    if not rate.startswith("lin_"):
+        raise ValueError(
+            f'learning_rate must be a number or "lin_" and a number, got the text {rate!r}. '
+            "In YAML, write 1.0e-4 or !!float 1e-4: it reads 1e-4 as text."
+        )
+    return {**arguments, "learning_rate": LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)}
 
 
 def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def train_representation(
     :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), as in Example 2; latent angles are then linear in
         the true positions
     :param still_timesteps: number of steps after ``learning_starts`` in which actions stay the identity; 0: κ is trained from
-        its random initialisation. With actions fixed, slow features are learned first (slow feature analysis, Wiskott and
+        the start, near the identity. With actions fixed, slow features are learned first (slow feature analysis, Wiskott and
         Sejnowski 2002, https://doi.org/10.1162/089976602317318938): one turn around a loop instead of two, one axis instead
         of a mixture
     :param policy_kwargs: additional arguments of the policy

@@ -16,6 +16,8 @@ from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
 WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change the environment
 CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms without support for discrete actions
 DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that support discrete actions only
+PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
+UNRELATED = ("_init_setup_model", "device", "policy_kwargs", "seed", "tensorboard_log", "verbose")  # not to the scores
 
 
 class Agent(NamedTuple):
@@ -62,6 +64,30 @@ def find_agent(text: str) -> Agent:
         legal += [STOCK] if f"{STOCK}/{algo}" in files else []
         raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
+
+
+def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param agent: the agent
+    :param entry: its hyperparameters
+    :return: the defaults of the algorithm for what the entry leaves out, and of its policy, as far as they are plain data:
+        where they change between versions, the same entry makes another agent
+    """
+    algorithm = ALGOS[agent.algo]
+    own = {key: value for key, value in _defaults_of(algorithm).items() if key not in entry and key not in UNRELATED}
+    policy = algorithm.policy_aliases.get(entry.get("policy", ""))
+    return {**own, "policy_kwargs": {} if policy is None else _defaults_of(policy)}
+
+
+def _defaults_of(cls: type) -> dict[str, Any]:
+    """Defaults of a constructor and of those of its base classes that it passes ``**kwargs`` to."""
+    found: dict[str, Any] = {}
+    for base in cls.__mro__:
+        parameters = inspect.signature(base.__init__).parameters if "__init__" in vars(base) else {}
+        found = {name: p.default for name, p in parameters.items() if isinstance(p.default, PLAIN)} | found
+        if parameters and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            break
+    return found
 
 
 def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:

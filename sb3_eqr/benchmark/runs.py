@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
-from sb3_eqr.benchmark.agents import Agent, find_agent, hyperparameters
+from sb3_eqr.benchmark.agents import Agent, defaults, find_agent, hyperparameters
 from sb3_eqr.benchmark.evaluation import check_game
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
@@ -63,6 +63,7 @@ class Run:
     :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
     :param entry: see :func:`~sb3_eqr.benchmark.agents.hyperparameters`
     :param command: the command that planned the run, with its suite and agents
+    :param defaults: see :func:`~sb3_eqr.benchmark.agents.defaults`; empty for a run of a version that did not record them
     """
 
     folder: pathlib.Path
@@ -73,6 +74,7 @@ class Run:
     protocol: dict[str, Any]
     entry: dict[str, Any]
     command: str = ""
+    defaults: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -88,6 +90,7 @@ class Run:
             "suite": self.suite,
             "protocol": self.protocol,
             "entry": {"algo": self.agent.algo, "file": str(self.agent.file), "hyperparameters": self.entry},
+            "defaults": self.defaults,
             "command": self.command,
         }
 
@@ -103,6 +106,10 @@ class Run:
         kept = find_checkpoints(self.folder)  # from which it resumes
         step = int(kept[-1].name.removeprefix(PREFIX)) if kept else 0
         return State("failed" if (self.folder / ERROR).is_file() else "waiting", step, 0.0)
+
+    def has_begun(self) -> bool:
+        """:return: whether there is something that further steps would continue, or a result"""
+        return (self.folder / RESULT).is_file() or bool(find_checkpoints(self.folder)) or self.is_locked()
 
     def is_locked(self) -> bool:
         """:return: whether a process holds the run"""
@@ -152,7 +159,8 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
             entry = hyperparameters(agent, protocol, action_space)
             for seed in range(n_seeds):
                 place = folder / "runs" / agent.name.replace(":", "-") / game / str(seed)
-                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command))
+                unnamed = defaults(agent, entry)
+                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command, unnamed))
     for run in runs:
         _check_plan(run)
     return sorted(runs, key=lambda run: run.seed)
@@ -161,11 +169,12 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
 def _check_plan(run: Run) -> None:
     """:raises ValueError: if the folder holds the same run, started with other settings"""
     path = run.folder / PLAN
-    begun = (run.folder / RESULT).is_file() or find_checkpoints(run.folder) or run.is_locked()
-    if not (path.is_file() and begun):
+    if not (path.is_file() and run.has_begun()):
         return
     old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(to_json(run.description()))
-    for what in ("protocol", "entry"):
+    for what in ("protocol", "entry", "defaults"):
+        if not old.get(what):
+            continue  # begun by a version that did not record the defaults
         before, now = (flatten({key: v for key, v in plan[what].items() if key != "file"}) for plan in (old, new))
         for key in sorted(before.keys() | now.keys()):
             if before.get(key) != now.get(key):
@@ -193,7 +202,8 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
         suite = suite.model_copy(update=update)
     write_suite(suite, path)
     for run in runs:
-        write_json(run.folder / PLAN, run.description())
+        if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
+            write_json(run.folder / PLAN, run.description())
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:
@@ -205,7 +215,7 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
     for path in sorted(folder.glob(f"runs/*/*/*/{PLAN}"), key=lambda path: (int(path.parent.name), path)):
         plan = json.loads(path.read_text(encoding="utf-8"))
         agent = Agent(plan["agent"], plan["entry"]["algo"], pathlib.Path(plan["entry"]["file"]))
-        settings = plan["protocol"], plan["entry"]["hyperparameters"], plan.get("command", "")
+        settings = plan["protocol"], plan["entry"]["hyperparameters"], plan.get("command", ""), plan.get("defaults", {})
         runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], *settings))
     if not runs:
         raise ValueError(

@@ -49,16 +49,17 @@ def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
 def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     """
     :param results: results of runs
-    :return: a sentence for every agent whose runs of a game differ in hyperparameters
+    :return: a sentence for every agent whose runs of a game differ in hyperparameters, or in defaults where both have them
     """
     found: dict[str, dict[str, None]] = {}
     first: dict[tuple[str, str], dict[str, Any]] = {}
     for result in results:
-        own = flatten(result["entry"]["hyperparameters"])
+        own = flatten(result["entry"]["hyperparameters"]), flatten(result.get("defaults", {}))
         usual = first.setdefault((result["agent"], result["game"]), own)
-        for key in own.keys() | usual.keys():
-            if own.get(key) != usual.get(key):
-                found.setdefault(result["agent"], {})[key] = None
+        keys = [key for key in own[0].keys() | usual[0].keys() if own[0].get(key) != usual[0].get(key)]
+        keys += [key for key in own[1].keys() & usual[1].keys() if own[1][key] != usual[1][key]]
+        for key in keys:
+            found.setdefault(result["agent"], {})[key] = None
     return [f"{agent}: its runs differ in {', '.join(sorted(keys))}." for agent, keys in found.items()]
 
 

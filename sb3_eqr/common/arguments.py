@@ -149,7 +149,7 @@ POLICY: dict[str, Rule] = {
     "n_atoms": integer(2),
     "v_min": number(),
     "v_max": number(),
-    "spread_init": number(1e-6) | NONE,
+    "spread_init": number(0, above=True) | NONE,
     "n_quantiles": integer(1),
 }
 BUFFER: dict[str, Rule] = {

@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch as th
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 
@@ -34,6 +35,7 @@ class _NormalizedDistance(th.autograd.Function):
         return distance
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         difference, distance, *rest = ctx.saved_tensors
         double, distance = 2 * gradient[..., None], distance[..., None]

@@ -53,11 +53,11 @@ class LossTerms(NamedTuple):
         return metrics
 
 
-class Following(NamedTuple):
+class NextEncodings(NamedTuple):
     """Encodings without gradient that the objective needs."""
 
     next_features: th.Tensor  # (B, F): from the target encoder, after the n-step transition; empty without TD loss
-    chooser_features: th.Tensor  # (B, F): the same, from the encoder of the network that chooses the next action
+    selection_features: th.Tensor  # (B, F): the same, from the encoder of the network that chooses the next action
     start: th.Tensor  # (B, D): x̄₀
     rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, for the AET loss
 
@@ -99,31 +99,31 @@ class Objective:
             gram = features.new_zeros(2, 2)
             for_head, for_state = branch(features, self.aux_gradient_share, gram)
         state = for_state if samples.mask is None else self.policy.latent_model.embedding(for_state)  # x₀, (B, D)
-        following = self._encode_following(samples, observations, state, coefs)
+        encodings = self._encode_next(samples, observations, state, coefs)
         td = priorities = q_values = None
         if coefs.td > 0:
-            td, priorities, q_values = self._td_terms(samples, for_head, following)
-        latent = self._latent_losses(samples, state, following, coefs)
+            td, priorities, q_values = self._td_terms(samples, for_head, encodings)
+        latent = self._latent_losses(samples, state, encodings, coefs)
         terms = zip(coefs, (td, *latent), strict=True)
         weighted = [term if coef == 1 else coef * term for coef, term in terms if term is not None]
         loss = (samples.weights * sum(weighted[1:], weighted[0])).mean()
         return LossTerms(td, *latent, loss, priorities, q_values, gram)
 
     @th.no_grad()
-    def _encode_following(
+    def _encode_next(
         self, samples: SequenceReplayBufferSamples, observations: PyTorchObs, state: th.Tensor, coefs: LossCoefs
-    ) -> Following:
+    ) -> NextEncodings:
         """Encode everything that needs no gradient. The target copy sees s_t with the online encoder's augmentation."""
         policy, embedding = self.policy, self.policy.latent_model_target.embedding
         has_td, has_latent = coefs.td > 0, samples.mask is not None
         is_separate, as_online = policy.latent_target is not policy.target, policy.latent_target_encodes_as_online
         of_target = [self.augment(samples.next_observations)] if has_td else []
         of_latent = [observations] if has_latent and not as_online else []
-        chooser, needs_chooser = None, has_td and self.double_q and not policy.target_encodes_as_online
-        if needs_chooser and is_separate and as_online:
+        selection, selects_apart = None, has_td and self.double_q and not policy.target_encodes_as_online
+        if selects_apart and is_separate and as_online:
             of_latent = of_target  # this encoder equals the online one, so encode in one pass with the rollout
-        elif needs_chooser:
-            chooser = policy.online.features_extractor(of_target[0])
+        elif selects_apart:
+            selection = policy.online.features_extractor(of_target[0])
         rollout = [flat(samples.rollout_observations)] if has_latent and coefs.aet > 0 else []
         pieces = chain(of_latent, map(self.augment, chain.from_iterable(map(in_pieces, rollout))))
         encoder, latent_encoder = policy.target.features_extractor, policy.latent_target.features_extractor
@@ -133,23 +133,23 @@ class Objective:
         else:
             passes = encode(encoder, chain(of_target, pieces))  # one tensor per batch
         next_features = next(passes) if has_td else state.new_empty(0)
-        if needs_chooser and chooser is None:
-            chooser = next(passes)
+        if selects_apart and selection is None:
+            selection = next(passes)
         start = embedding(next(passes)) if has_latent and not as_online else state.detach()
         states = list(passes)
         rolled = embedding(th.cat(states)).view(*samples.mask.shape, -1) if states and samples.mask is not None else None
-        return Following(next_features, next_features if chooser is None else chooser, start, rolled)
+        return NextEncodings(next_features, next_features if selection is None else selection, start, rolled)
 
     def _td_terms(
-        self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following
+        self, samples: SequenceReplayBufferSamples, features: th.Tensor, encodings: NextEncodings
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
-        online, target, n_samples = self.policy.online, self.policy.target, len(state)
+        online, target, n_samples = self.policy.online, self.policy.target, len(features)
         # One pass of the online head, with one draw of noise, for both uses.
-        states = [state, following.chooser_features] if self.double_q else [state]
-        outputs = online.head(th.cat(states), noisy=True)  # (B or 2 B, N, A)
+        inputs = [features, encodings.selection_features] if self.double_q else [features]
+        outputs = online.head(th.cat(inputs), noisy=True)  # (B or 2 B, N, A)
         with th.no_grad():
-            next_outputs = target.head(following.next_features, noisy=True)  # (B, N, A)
+            next_outputs = target.head(encodings.next_features, noisy=True)  # (B, N, A)
             values = online.expectation(outputs.detach())  # (B or 2 B, A)
             next_values = values[n_samples:] if self.double_q else target.expectation(next_outputs)
             next_best = of_actions(next_outputs, next_values.argmax(dim=1, keepdim=True))  # (B, N)
@@ -159,7 +159,7 @@ class Objective:
         return loss, priorities, values.gather(1, samples.actions).squeeze(dim=1)
 
     def _latent_losses(
-        self, samples: SequenceReplayBufferSamples, state: th.Tensor, following: Following, coefs: LossCoefs
+        self, samples: SequenceReplayBufferSamples, state: th.Tensor, encodings: NextEncodings, coefs: LossCoefs
     ) -> LatentLosses:
         """The auxiliary losses along the rollout."""
         policy = self.policy
@@ -170,8 +170,8 @@ class Objective:
             samples.rollout_actions,
             samples.rollout_rewards if coefs.reward > 0 else None,
             samples.mask,
-            following.start,
-            following.rollout,
+            encodings.start,
+            encodings.rollout,
             policy.latent_model_target if coefs.symmetry > 0 else None,
             policy.project if coefs.aet > 0 else None,
             policy.target_project,

@@ -74,14 +74,14 @@ class EqRPolicy(BasePolicy):
     :param layer_norm: whether to apply layer norm to the trunk's features, with or without a group
     :param center: whether to subtract the features' running mean before the layer norm; unused without layer norm
     :param head_input: input of the Q head: "state", the group elements (the paper), or "trunk", the trunk's features; only the
-        latent model then uses group elements, and the AET loss needs ``projection="own"`` or "none"
+        latent model then uses group elements, and with a group the AET loss needs ``projection="own"`` or "none"
     :param dueling: whether to use value and advantage streams
     :param noisy: whether to use factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243); Table 5 uses 0.5
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
         (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
         and ``layer_norm=False``, since it predicts values in [0, 1]
-    :param latent_hidden_dim: width of the hidden layers of κ, r_ψ, ρ and of the projection b
+    :param latent_hidden_dim: width of the hidden layers of κ, r_ψ and ρ, and of ``projection="own"``
     :param latent_norm: norm of these layers: "layer", or "batch" (appendix B.4), with which an unusual state in a batch
         changes the predictions for all others (docs/gradients.md)
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or

@@ -35,10 +35,10 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
         return outputs.mean(dim=1)
 
     def td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+        self, current: th.Tensor, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """The quantile Huber loss, which is also the priority."""
-        loss = quantile_huber_loss(current, rewards + discounts * following)
+        loss = quantile_huber_loss(current, rewards + discounts * next_outputs)
         return loss, loss.detach()
 
 

@@ -53,12 +53,12 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         return (outputs.softmax(dim=1) * support).sum(dim=1)
 
     def td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+        self, current: th.Tensor, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """The cross-entropy with the projected target distribution; the priority is the KL divergence between the two."""
         with th.no_grad():
             values = th.addcmul(rewards, discounts, self.support)  # (B, N)
-            target = categorical_projection(values, following.softmax(dim=1), self.v_min, self.v_max)
+            target = categorical_projection(values, next_outputs.softmax(dim=1), self.v_min, self.v_max)
         return categorical_loss(current, target)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -75,9 +75,10 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     :param n_atoms: number of atoms of the return distribution, ≥ 2; 51 in Table 5
     :param v_min: the lowest return; -10 for rewards clipped to [-1, 1] (Bellemare et al. 2017)
     :param v_max: the highest return, > ``v_min``; 10 for rewards clipped to [-1, 1]
-    :param spread_init: spread s > 0 of the returns that an untrained head predicts: p(z) is proportional to
-        1 / (1 + (z / s)²), a Cauchy distribution around 0, or around the return nearest to 0. ``None``: all returns are about
-        equally likely, as in C51, and priorities then hardly depend on rewards (docs/gradients.md)
+    :param spread_init: spread of the returns that an untrained head predicts, > 0, as a share of ``v_max - v_min``; with s
+        this share times the range, p(z) is proportional to 1 / (1 + (z / s)²), a Cauchy distribution around 0, or around the
+        return nearest to 0. 0.05 is 1 on the default range. ``None``: all returns are about equally likely, as in C51, and
+        priorities then hardly depend on rewards (docs/gradients.md)
     :param kwargs: the parameters of :class:`~sb3_eqr.common.policies.EqRPolicy`
     :raises ValueError: if an argument is out of range
     """
@@ -93,7 +94,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         n_atoms: int = 51,
         v_min: float = -10.0,
         v_max: float = 10.0,
-        spread_init: float | None = 1.0,
+        spread_init: float | None = 0.05,
         **kwargs: Any,
     ):
         check_arguments({"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max, "spread_init": spread_init}, POLICY)
@@ -121,7 +122,8 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         network = self._make_network(EqRCategoricalNetwork, self.n_atoms, v_min=self.v_min, v_max=self.v_max)
         if self.spread_init is not None:
             centre = network.support[network.support.abs().argmin()]
-            network.head.shift(-((network.support - centre) / self.spread_init).square().log1p())  # Cauchy, up to a constant
+            scale = self.spread_init * (self.v_max - self.v_min)
+            network.head.shift(-((network.support - centre) / scale).square().log1p())  # Cauchy, up to a constant
         return network
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configurat
 from sb3_eqr.common.networks.encoders import ImpalaTrunk
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
-from sb3_eqr.configurations import configuration_files
+from sb3_eqr.configurations import configuration_files, with_schedule
 from tests.toys import ImageEnv
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -194,6 +194,8 @@ def test_rl_zoos_schedules_are_schedules():
     """lin_1.5e-3 in the file decreases from 1.5e-3 to 0."""
     learning_rate = load_configuration("stock/qrdqn", "LunarLander-v3")["learning_rate"]
     assert [learning_rate(remaining) for remaining in (1, 0.5, 0)] == pytest.approx([1.5e-3, 0.75e-3, 0])
+    with pytest.raises(ValueError, match=r"learning_rate must be .*\"lin_\" and a number, got the text '1e-4'.* write 1.0e-4"):
+        with_schedule({"learning_rate": "1e-4"})  # YAML reads 1e-4 as text
 
 
 def test_unknown_names_raise():

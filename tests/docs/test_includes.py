@@ -109,8 +109,8 @@ PROMISES: dict[str, dict[str, Promise]] = {
             text=("`Objective._td_terms`", "`double_q`", "`td_loss`"),
         ),
         "sb3_eqr/eqr_qrdqn/policies.py, EqRQuantileNetwork.td_loss": Promise(
-            code=("quantile_huber_loss(current, rewards + discounts * following)", "return loss, loss.detach()"),
-            text=("`EqRQuantileNetwork.td_loss`", "The priority of a sample is its loss", "`following`"),
+            code=("quantile_huber_loss(current, rewards + discounts * next_outputs)", "return loss, loss.detach()"),
+            text=("`EqRQuantileNetwork.td_loss`", "The priority of a sample is its loss", "`next_outputs`"),
         ),
         "sb3_eqr/common/losses.py, quantile_huber_loss": Promise(
             code=("th.where(wanted < predicted, 1 - midpoints, midpoints)", 'reduction="none")).sum(dim=1).mean(dim=1)'),

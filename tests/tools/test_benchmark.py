@@ -1,5 +1,6 @@
 """The command line of the benchmark, from an empty folder to a report, on Ray."""
 
+import dataclasses
 import json
 import pathlib
 import sys
@@ -17,6 +18,7 @@ from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
+from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
 
 FAST = (
     "{policy: MlpPolicy, n_timesteps: 9, learning_starts: 9, batch_size: 4, buffer_size: 99, policy_kwargs: {net_arch: [8]}}"
@@ -217,6 +219,20 @@ def test_runs_with_different_settings_cannot_share_a_folder(files):
         plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
     with pytest.raises(ValueError, match="must hold a benchmark of suite 'smoke', got 'tiny'"):
         write_plan(files / "b", load_suite("smoke"), [])
+
+
+def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, monkeypatch):
+    suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
+    (run,) = plan_runs(files / "b", suite, ["eqr_rainbow"], 1)
+    assert run.defaults["td_coef"] == 1.0 and run.defaults["policy_kwargs"]["n_atoms"] == 51
+    assert "learning_starts" not in run.defaults  # which the entry has
+    write_plan(files / "b", suite, [run])
+    (run.folder / "result.json").write_text("{}")
+    monkeypatch.setattr(EqRRainbowPolicy.__init__, "__defaults__", (11, *EqRRainbowPolicy.__init__.__defaults__[1:]))
+    with pytest.raises(ValueError, match=r"policy_kwargs.n_atoms must be 51, as when the run was started, got 11"):
+        plan_runs(files / "b", suite, ["eqr_rainbow"], 1)
+    write_plan(files / "b", suite, [dataclasses.replace(run, defaults={})])
+    assert read_plan(files / "b")[0].defaults == run.defaults  # a finished run keeps what it was started with
 
 
 def test_missing_ray_prints_an_error(files, sb3_eqr, monkeypatch):

@@ -359,6 +359,17 @@ def test_runs_with_different_hyperparameters_are_reported(tmp_path):
     ]
 
 
+def test_runs_with_different_defaults_are_reported(tmp_path):
+    def change(result):
+        if result["agent"] == BASE and result["seed"] != 1:  # seed 1 is of a version that did not record them
+            result["defaults"] = {"gamma": 0.99, "policy_kwargs": {"noisy": result["seed"] == 2}}
+        return result
+
+    assert compare([a_benchmark(tmp_path / "a", change=change)], {}, False).notes == [
+        f"{BASE}: its runs differ in policy_kwargs.noisy."
+    ]
+
+
 def test_agents_that_learn_nothing_are_reported(tmp_path):
     def change(result):
         result["entry"]["hyperparameters"]["learning_starts"] = 100_000 if result["agent"] == "dqn" else 99_999

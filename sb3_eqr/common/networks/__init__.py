@@ -1,4 +1,4 @@
 """
-Networks: ``layers`` contains layers that PyTorch lacks, ``encoders`` map observations to group elements, and ``q_networks``
-map these to Q values.
+Networks: ``layers`` contains layers that PyTorch lacks, ``encoders`` map observations to features or group elements, and
+``q_networks`` map these to Q values.
 """

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch as th
 from torch import nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 Noise = tuple[th.Tensor, th.Tensor]  # for one layer: f(ε_out), (out_features,), and f(ε_in), (in_features,)
@@ -77,6 +78,7 @@ class _NoisyProduct(th.autograd.Function):
         return F.linear(inputs, noisy_weight, th.addcmul(bias, bias_sigma, noise_out))
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         inputs, noisy_weight, noise, noise_out = ctx.saved_tensors
         of_weight, of_bias = gradient.mT @ inputs, gradient.sum(dim=0)

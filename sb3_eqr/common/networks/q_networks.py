@@ -50,13 +50,13 @@ class EqRNetwork(BasePolicy):
 
     @abstractmethod
     def td_loss(
-        self, current: th.Tensor, following: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
+        self, current: th.Tensor, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
         The TD loss of this kind of head.
 
         :param current: outputs of the online head for (s_t, a_t), (B, N)
-        :param following: outputs of the target head after the n-step transition, for the best action, no gradient, (B, N)
+        :param next_outputs: outputs of the target head after the n-step transition, for the best action, no gradient, (B, N)
         :param rewards: the n-step return, (B, 1)
         :param discounts: 0 where the transition ended in a terminal state, otherwise γ to the power of its length, (B, 1)
         :return: loss, (B,), and priorities ≥ 0 without gradient, (B,)

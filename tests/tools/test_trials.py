@@ -1,0 +1,82 @@
+"""Trials of settings, and the linear probes of their agents."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch as th
+import yaml
+
+from benchmarks.probes import explained, probe
+from benchmarks.trials import check_names, merged, table
+from sb3_eqr import EqRQRDQN
+from tests.toys import ImageEnv
+
+ROW = {"trial": "a", "game": "Breakout", "seed": 0, "steps": 10, "agent": "rainbow", "changes": {"gamma": 0.9}}
+
+
+def test_changes_are_merged_and_an_empty_dictionary_clears():
+    entry = {"gamma": 0.9, "policy_kwargs": "dict(net_arch=[8], noisy=True)", "replay_buffer_kwargs": {"alpha": 0.5}}
+    found = merged(entry, {"policy_kwargs": {"noisy": False}, "replay_buffer_kwargs": {}, "n_steps": 3})
+    kept = {"net_arch": [8], "noisy": False}
+    assert found == {"gamma": 0.9, "policy_kwargs": kept, "replay_buffer_kwargs": {}, "n_steps": 3}
+
+
+def test_another_trial_of_the_same_name_is_refused():
+    wanted = [("a", "Breakout", 1)]
+    check_names([ROW], {"a": {"agent": "rainbow", "changes": {"gamma": 0.9}}}, wanted, 10)
+    check_names([ROW], {"a": {"agent": "rainbow", "changes": {"gamma": 0.8}}}, wanted, 20)  # other steps
+    with pytest.raises(SystemExit, match=r"a, Breakout, 10 steps: .* got .*0.9.* instead of .*0.8"):
+        check_names([ROW], {"a": {"agent": "rainbow", "changes": {"gamma": 0.8}}}, wanted, 10)
+
+
+def test_the_table_names_cells_with_fewer_seeds():
+    """Scores 1 and 3 have the mean 2 and the standard error √2 / √2 = 1."""
+    result = {"curve": [0.5], "seconds": 7.0}
+    rows = [{**ROW, **result, "seed": seed, "score": score} for seed, score in ((0, 1.0), (1, 3.0))]
+    rows.append({**ROW, **result, "game": "Freeway", "score": 4.0})
+    assert table(rows, ["a"], ["Breakout", "Freeway"], 10).splitlines()[2] == (
+        "| a | 2 | 2.00 ± 1.00, 0.50 ± 0.00 | 4.00, 0.50 (1) | 7 |"
+    )
+
+
+def test_a_failed_trial_is_an_error(tmp_path):
+    (tmp_path / "trials.yml").write_text(yaml.safe_dump({"wrong": {"agent": "rainbow", "changes": {"gama": 0.9}}}))
+    command = [sys.executable, "-m", "benchmarks.trials", str(tmp_path / "trials.yml"), "--rows", str(tmp_path / "rows.jsonl")]
+    found = subprocess.run([*command, "--games", "Breakout", "--seeds", "0"], capture_output=True, text=True, check=False)
+    assert found.returncode == 1
+    assert "gama" in found.stderr and "These runs failed, see their errors above: ('wrong', 'Breakout', 0)" in found.stderr
+
+
+def test_probing_changes_nothing_and_separates_trunk_and_group():
+    """The target is a linear function of the trunk's features: R² is 1 for them, less for 2 blocks of SO(2)."""
+    network = {
+        "group": "SO(2)",
+        "n_blocks": 2,
+        "whiten": True,
+        "head_input": "state",
+        "features_extractor_kwargs": {"features_dim": 8},
+    }
+    settings = {"learning_starts": 20, "buffer_size": 60, "batch_size": 8, "symmetry_coef": 0.0, "seed": 0}
+    model = EqRQRDQN("CnnPolicy", ImageEnv(), **settings, policy_kwargs={**network, "projection": "none"}).learn(40)
+    rng = np.random.default_rng(0)
+    seen = rng.integers(0, 256, (6_000, 1, 36, 36), dtype=np.uint8)
+    with th.no_grad():
+        trunk = model.policy.online.features_extractor.trunk.eval()
+        known = trunk(th.as_tensor(seen) / 255).double().numpy() @ rng.normal(size=8)
+    before = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    model.policy.train()
+    found = probe(model, (seen, {"target": known}))
+    assert json.dumps(list(found)) == '["trunk", "state"]'
+    assert found["trunk"]["target"] > 0.95 and found["state"]["target"] < found["trunk"]["target"] - 0.02
+    assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
+    assert model.policy.training
+
+
+def test_r2_of_noise():
+    """Two inputs with weights 3 and 4 and noise of variance 25: R² is 25 / 50."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(6_000, 2))
+    assert explained(x, x @ [3.0, 4.0] + 5 * rng.normal(size=6_000)) == pytest.approx(0.5, abs=0.04)
