@@ -112,7 +112,8 @@ def keep_constant_gradient(model: EqRRainbow) -> None:
 
     def forward(layer: Centering, features: th.Tensor) -> th.Tensor:
         if layer.training and th.is_grad_enabled():
-            layer.note(features.detach())
+            mean = features.detach().mean(dim=0)
+            layer.note(mean, features.detach() - mean)
         return features - layer.running_mean
 
     for layer in model.policy.online.modules():

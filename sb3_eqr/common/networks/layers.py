@@ -246,21 +246,21 @@ class Centering(nn.Module):
         """
         if self.training and th.is_grad_enabled() and len(features) > 1:
             mean = features.mean(dim=0)
-            self.note(features.detach())
+            self.note(mean.detach(), features.detach() - mean.detach())
             features = features - (mean - mean.detach())  # subtracts 0; the gradient loses its mean
         elif self.training and th.is_grad_enabled():
             self.batch_mean.copy_(self.running_mean)  # update then moves nothing
         return features - self.running_mean
 
-    def note(self, features: th.Tensor) -> None:
+    def note(self, mean: th.Tensor, deviations: th.Tensor) -> None:
         """
         Note the mean of a batch for :meth:`update`.
 
-        :param features: (B, D) without gradient, B ≥ 2
+        :param mean: (D,) without gradient
+        :param deviations: (B, D) from it, without gradient, B ≥ 2
         """
-        variance, mean = th.var_mean(features, dim=0)
-        self.batch_mean.copy_(mean)
-        self.batch_error.copy_(variance.sum() / len(features))
+        self.batch_mean.copy_(mean)  # th.var_mean takes 10 to 20 times as long as this along the first dimension
+        self.batch_error.copy_(deviations.square().sum() / ((len(deviations) - 1) * len(deviations)))
 
     def update(self) -> None:
         """Called after each gradient step; without effect in eval mode."""
