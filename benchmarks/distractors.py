@@ -20,11 +20,11 @@ STEPS = 8_000
 SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
 GAMES = ("torus_of_8",)
 NAMES = {
-    "default": "EqR, the defaults",
+    "default": "EqR",
     "aet_5": "EqR, aet_coef=5",
-    "contrastive": "contrastive AET loss",
-    "distance": "AET loss without predictor",
-    "no_group": "the defaults, no group",
+    "contrastive": "EqR, contrastive AET loss",
+    "distance": "EqR without predictor",
+    "no_group": "EqR without a group",
     "plain": "Q-learning alone",
 }
 
