@@ -9,7 +9,7 @@ import torch as th
 from rich.console import Console
 
 from sb3_eqr.benchmark.dispatch import make_table, run_benchmark
-from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, write_plan
+from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.envs import import_packages
@@ -54,7 +54,7 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
             if getattr(args, name) is not None:
                 flag = f"--{name.replace('_', '-')}"
                 raise ValueError(f"{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
-        return read_plan(args.folder)
+        return with_present_defaults(read_plan(args.folder))
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")
     if args.steps is not None and args.steps < 1:

@@ -13,6 +13,7 @@ from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
 from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints
 from sb3_eqr.common.files import atomic_write
+from sb3_eqr.zoo import register
 
 SUITE = "suite.yml"  # in the folder of the benchmark
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # in that of a run
@@ -164,6 +165,22 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
     for run in runs:
         _check_plan(run)
     return sorted(runs, key=lambda run: run.seed)
+
+
+def with_present_defaults(runs: list[Run]) -> list[Run]:
+    """
+    :param runs: runs of a folder
+    :return: the same, where those without a result have the defaults of this version of the package
+    :raises ValueError: if a run that has begun was started with others
+    """
+    register()
+    found = [
+        run if (run.folder / RESULT).is_file() else dataclasses.replace(run, defaults=defaults(run.agent, run.entry))
+        for run in runs
+    ]
+    for run in found:
+        _check_plan(run)
+    return found
 
 
 def _check_plan(run: Run) -> None:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from filelock import FileLock
 from ray.cluster_utils import Cluster
 from ray.exceptions import RayError
 from rich.console import Console
@@ -15,7 +16,7 @@ from rich.console import Console
 from sb3_eqr import benchmark, cli
 from sb3_eqr.benchmark import dispatch
 from sb3_eqr.benchmark.agents import find_agent
-from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, write_plan
+from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
@@ -231,6 +232,16 @@ def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, monk
     monkeypatch.setattr(EqRRainbowPolicy.__init__, "__defaults__", (11, *EqRRainbowPolicy.__init__.__defaults__[1:]))
     with pytest.raises(ValueError, match=r"policy_kwargs.n_atoms must be 51, as when the run was started, got 11"):
         plan_runs(files / "b", suite, ["eqr_rainbow"], 1)
+    assert with_present_defaults([run]) == [run]  # it is finished
+    (run.folder / "result.json").unlink()
+    (waiting,) = with_present_defaults([run])
+    assert waiting.defaults["policy_kwargs"]["n_atoms"] == 11
+    with (
+        FileLock(run.folder / "lock"),
+        pytest.raises(ValueError, match=r"policy_kwargs.n_atoms must be 51, as when the run was"),
+    ):
+        with_present_defaults([run])
+    (run.folder / "result.json").write_text("{}")
     write_plan(files / "b", suite, [dataclasses.replace(run, defaults={})])
     assert read_plan(files / "b")[0].defaults == run.defaults  # a finished run keeps what it was started with
 
