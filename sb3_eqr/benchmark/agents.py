@@ -83,7 +83,8 @@ def _defaults_of(cls: type) -> dict[str, Any]:
     """Defaults of a constructor and of those of its base classes that it passes ``**kwargs`` to."""
     found: dict[str, Any] = {}
     for base in cls.__mro__:
-        parameters = inspect.signature(base.__init__).parameters if "__init__" in vars(base) else {}
+        init = vars(base).get("__init__")
+        parameters = {} if init is None else inspect.signature(init).parameters
         found = {name: p.default for name, p in parameters.items() if isinstance(p.default, PLAIN)} | found
         if parameters and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             break

@@ -52,7 +52,7 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     :return: a sentence for every agent whose runs of a game differ in hyperparameters, or in defaults where both have them
     """
     found: dict[str, dict[str, None]] = {}
-    first: dict[tuple[str, str], dict[str, Any]] = {}
+    first: dict[tuple[str, str], tuple[dict[str, Any], dict[str, Any]]] = {}
     for result in results:
         own = flatten(result["entry"]["hyperparameters"]), flatten(result.get("defaults", {}))
         usual = first.setdefault((result["agent"], result["game"]), own)
