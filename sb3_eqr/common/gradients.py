@@ -27,7 +27,8 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
     """
     As ``loss.backward()``, but replaces the gradients of the parameters instead of accumulating them, which saves one
     operation per parameter. The gradient of a frozen parameter, or of one that the loss does not depend on, becomes
-    ``None``.
+    ``None``. As with ``backward``, a gradient has the strides of its parameter: a fused optimiser reads both in the order
+    of memory.
 
     :param loss: ()
     :param parameters: the trained parameters
@@ -38,6 +39,8 @@ def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> Non
         if parameter.requires_grad:
             trained.append(parameter)
     for parameter, gradient in zip(trained, th.autograd.grad(loss, trained, allow_unused=True), strict=True):
+        if gradient is not None and gradient.stride() != parameter.stride():
+            gradient = th.empty_like(parameter).copy_(gradient)
         parameter.grad = gradient
 
 

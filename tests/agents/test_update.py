@@ -1,14 +1,18 @@
 """A single update in detail: targets, weights, priorities, gradients."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common import objective
 from sb3_eqr.common.networks.encoders import NormalizedExtractor
-from tests.models import MAKERS, PAPER, loss_terms, train_on
+from tests.models import EITHER, MAKERS, PAPER, loss_terms, train_on
 from tests.toys import ChainEnv, ImageEnv
 
 
@@ -185,6 +189,23 @@ def test_a_pass_on_a_cpu_is_split_into_pieces(make, monkeypatch, policy, size):
         losses.append(loss_terms(model, samples).aet)
     th.testing.assert_close(losses[0], losses[2])
     th.testing.assert_close(losses[1], losses[2])
+
+
+@EITHER
+@pytest.mark.parametrize("images", ["one channel", "stacked", "in a dictionary"])
+def test_a_fused_optimizer_trains_as_a_plain_one(make, images):
+    """Fused, PyTorch's Adam ignores strides: it needs gradients in the memory layout of their parameters."""
+    env = SimpleMultiObsEnv(channel_last=True) if images == "in a dictionary" else ImageEnv()
+    env.reset(seed=0)
+    trained = []
+    for fused in (False, True):
+        vec_env = make_vec_env(lambda: copy.deepcopy(env))
+        vec_env = VecFrameStack(vec_env, 4) if images == "stacked" else vec_env
+        policy = "MultiInputPolicy" if images == "in a dictionary" else "CnnPolicy"
+        trained.append(make(vec_env, policy, policy_kwargs={"optimizer_kwargs": {"fused": fused}}).learn(50))
+    assert trained[0]._n_updates > 0
+    for a, b in zip(trained[0].policy.parameters(), trained[1].policy.parameters(), strict=True):
+        th.testing.assert_close(a, b, rtol=1e-3, atol=2e-5)  # a step of the default learning rate is 1e-4
 
 
 def test_online_and_target_observations_are_augmented(make, monkeypatch):

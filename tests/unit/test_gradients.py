@@ -131,6 +131,19 @@ def test_assigned_gradients_equal_those_of_backward():
         assert (gradient is None) == (parameter.grad is None) and (gradient is None or th.equal(gradient, parameter.grad))
 
 
+def test_gradients_have_the_strides_of_their_parameters():
+    """A fused optimiser reads a parameter and its gradient in the order of memory, whatever their strides."""
+    th.manual_seed(0)
+    network = nn.Sequential(nn.Conv2d(2, 3, 3), nn.ReLU(), nn.Conv2d(3, 4, 2))
+    images = th.randn(5, 2, 6, 6).contiguous(memory_format=th.channels_last)
+    parameters = list(network.parameters())
+    raw = th.autograd.grad(network(images).square().sum(), parameters)
+    assert any(a.stride() != b.stride() for a, b in zip(raw, parameters, strict=True)), "nothing is tested"
+    assign_gradients(network(images).square().sum(), parameters)
+    assert [p.grad.stride() for p in parameters] == [p.stride() for p in parameters]
+    same([p.grad for p in parameters], raw)
+
+
 @pytest.mark.parametrize("max_norm", [None, 0.1, 100.0])
 def test_clipping_equals_pytorchs(max_norm):
     th.manual_seed(0)

@@ -55,9 +55,7 @@ class ConvTrunk(nn.Sequential):
         Convert the weights to the memory format of :meth:`forward`, so that calls need not copy them. The constructor does not
         do this, because the orthogonal initialisation of SB3's PPO requires PyTorch's default layout.
         """
-        first = next(iter(self.parameters()), None)
-        if first is not None and first.shape[1] > 1:  # images with one channel have only one layout
-            self.to(memory_format=self.memory_format)  # type: ignore[call-overload]
+        self.to(memory_format=self.memory_format)  # type: ignore[call-overload]
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """Map images, (B, C, H, W), floating point, to features, (B, trunk_dim)."""
