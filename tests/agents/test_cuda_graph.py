@@ -18,7 +18,7 @@ ENVS = {
     "MultiInputPolicy": lambda: np.random.seed(0) or SimpleMultiObsEnv(channel_last=True),  # its constructor draws the images
 }
 POLICIES = pytest.mark.parametrize("policy", ENVS)
-GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+NEEDS_GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 
 
 @EITHER
@@ -67,7 +67,8 @@ def same_within(a, b, tolerance):
     return all((x - y).abs().max() <= tolerance for x, y in zip(a.policy.parameters(), b.policy.parameters(), strict=True))
 
 
-@GPU
+@pytest.mark.gpu
+@NEEDS_GPU
 @POLICIES
 def test_captured_updates_equal_eager_ones_to_rounding(make, policy):
     models = [make(ENVS[policy](), policy, device="cuda", cuda_graph=asked).learn(120) for asked in (False, True)]
@@ -76,7 +77,8 @@ def test_captured_updates_equal_eager_ones_to_rounding(make, policy):
     assert same_within(*models, 1e-4)
 
 
-@GPU
+@pytest.mark.gpu
+@NEEDS_GPU
 def test_changes_that_a_graph_depends_on_recapture_it(make):
     """The captured run equals the eager one after a callback changes a weight, a network is frozen, or a reset."""
     models = []
@@ -90,7 +92,8 @@ def test_changes_that_a_graph_depends_on_recapture_it(make):
     assert models[1]._captured.failure is None and same_within(*models, 1e-4)
 
 
-@GPU
+@pytest.mark.gpu
+@NEEDS_GPU
 def test_updates_that_cannot_be_captured_run_eagerly(make):
     """A matrix exponential reads a number back."""
     network = {"group": "SO(3)", "parameterization": "exp"}
