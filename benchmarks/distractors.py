@@ -18,7 +18,7 @@ from sb3_eqr.plot_style import looks, styled
 
 STEPS = 8_000
 SEEDS = range(3, 15)  # 0 to 2 served to choose the settings
-GAMES = ("torus_of_8",)
+GAMES = ("torus_of_4", "torus_of_8")
 NAMES = {
     "default": "EqR",
     "aet_5": "EqR, aet_coef=5",
