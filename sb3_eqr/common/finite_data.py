@@ -1,4 +1,4 @@
-"""Rejects data from environments and users that are not finite, before they are stored or used."""
+"""Checks data from environments and users before they are used, and stores them as the environment returned them."""
 
 import warnings
 from typing import Any
@@ -16,7 +16,8 @@ STATISTICS = ("obs_rms", "ret_rms")  # attributes of VecNormalize
 class FiniteData(OffPolicyAlgorithm):
     """
     Mixin that rejects observations, rewards and terminal observations that are NaN or infinite, in training and in
-    ``predict``. A rejected step does not change the replay buffer and the statistics of VecNormalize.
+    ``predict``. A rejected step does not change the replay buffer and the statistics of VecNormalize. Terminal observations
+    are stored as the environment returned them, and no stored step follows one that a stop of the training has left out.
     """
 
     trained_normalized = False  # whether the last environment was wrapped in VecNormalize; saved with the model
@@ -31,9 +32,15 @@ class FiniteData(OffPolicyAlgorithm):
         return result
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
-        """As SB3's ``collect_rollouts``; errors state if an environment violates gymnasium's interface."""
+        """
+        As SB3's ``collect_rollouts``, with two differences: errors state if an environment violates gymnasium's interface, and
+        after a callback has stopped the training, the next call of ``learn`` resets the environment.
+        """
         with environment_errors(self.num_timesteps):
-            return super().collect_rollouts(*args, **kwargs)
+            result = super().collect_rollouts(*args, **kwargs)
+        if not result.continue_training:
+            self._last_obs = None  # the environment has already stepped, and this step was not stored
+        return result
 
     def _warn_without_normalization(self) -> None:
         """Warn if an agent trained with VecNormalize would now get raw observations, with which its actions are useless."""
@@ -65,12 +72,46 @@ class FiniteData(OffPolicyAlgorithm):
             check_finite("reward", reward if normalize is None else normalize.get_original_reward(), step)
             for info in [*infos, *original_infos(normalize)]:
                 check_finite("terminal observation", info.get("terminal_observation", 0), step)
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            if normalize is None:
+                super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            else:
+                self._store_original(normalize, replay_buffer, buffer_action, new_obs, dones, infos)
         except ValueError:
             self._last_obs = None  # the environment has already stepped, so the next call of learn must reset it
             restore_statistics(normalize, self._statistics)
             raise
         self._statistics = statistics_of(normalize)
+
+    def _store_original(
+        self,
+        normalize: VecNormalize,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        As SB3's ``_store_transition`` behind VecNormalize, which casts normalised terminal observations to integers, where
+        observations are integers, and stores the clipped ones.
+        """
+        original = normalize.get_original_obs()
+        next_obs: Any = normalize.get_original_obs()  # another copy
+        for i, done in enumerate(dones):
+            if done and infos[i].get("terminal_observation") is not None:
+                found: Any = terminal_observation(normalize, infos, i)
+                for key in next_obs if isinstance(next_obs, dict) else [...]:
+                    into, value = (next_obs, found) if key is ... else (next_obs[key], found[key])
+                    into[i] = value if value.dtype == into.dtype else rounded(value, into.dtype)
+        replay_buffer.add(
+            self._last_original_obs,  # type: ignore[arg-type]
+            next_obs,
+            buffer_action,
+            normalize.get_original_reward(),
+            dones,
+            infos,
+        )
+        self._last_obs, self._last_original_obs = new_obs, original  # type: ignore[assignment]
 
     def predict(
         self,
@@ -96,6 +137,24 @@ def original_infos(normalize: VecNormalize | None) -> list[dict[str, Any]]:
     """
     innermost = None if normalize is None else normalize.unwrapped
     return innermost.buf_infos if isinstance(innermost, DummyVecEnv) else []
+
+
+def terminal_observation(normalize: VecNormalize, infos: list[dict[str, Any]], i: int) -> Any:
+    """
+    The last observation of the episode that environment ``i`` has ended: as the environment returned it where it is kept,
+    else computed from the normalised and clipped one.
+    """
+    if normalize.venv is normalize.unwrapped and isinstance(normalize.venv, DummyVecEnv):
+        return normalize.venv.buf_infos[i]["terminal_observation"]
+    return normalize.unnormalize_obs(infos[i]["terminal_observation"])
+
+
+def rounded(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Round to the nearest value of an integer ``dtype``; others are cast."""
+    if not np.issubdtype(dtype, np.integer):
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    return np.rint(values).clip(limits.min, limits.max).astype(dtype)
 
 
 def statistics_of(normalize: VecNormalize | None) -> dict[str, Any] | None:

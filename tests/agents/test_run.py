@@ -24,7 +24,7 @@ from stable_baselines3.common.envs import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from torch import nn
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
@@ -467,6 +467,60 @@ def test_vec_normalize(make):
     np.testing.assert_allclose(samples.observations, env.normalize_obs(raw), rtol=1e-6)
     assert samples.rollout_rewards.abs().max() <= env.clip_reward
     model.learn(20, reset_num_timesteps=False)
+
+
+class Drawn(gym.Env):
+    """Random observations, in episodes that are truncated after ten steps; keeps the last one of each."""
+
+    def __init__(self, space):
+        self.observation_space, self.action_space, self.last = space, spaces.Discrete(2), []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.time += 1
+        found = self.observation_space.sample()
+        if self.time == 10:
+            self.last.append(found)
+        return found, 0.0, False, self.time == 10, {}
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecMonitor], ids=["direct", "wrapped"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.float32])
+def test_terminal_observations_behind_vec_normalize_are_stored_as_they_were(make, dtype, wrapper):
+    """SB3's way casts the normalised ones to the space's integers, and keeps VecNormalize's clipping."""
+    low, high = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype != np.float32 else (-1, 1)
+    env = Drawn(spaces.Box(low, high, (3,), dtype, seed=0))
+    is_kept = wrapper is not VecMonitor  # by DummyVecEnv; behind another wrapper what was clipped is lost
+    model = make(VecNormalize(wrapper(DummyVecEnv([lambda: env])), clip_obs=0.5 if is_kept else 10.0), learning_starts=1_000)
+    model.learn(100)
+    rows = np.flatnonzero(model.replay_buffer.timeouts[:, 0])
+    stored = model.replay_buffer._stores[""].observations(rows, np.zeros_like(rows), following=True)
+    assert len(rows) == len(env.last) == 10 and stored.dtype == dtype
+    np.testing.assert_allclose(stored, env.last, atol=0 if is_kept else 1e-5)
+
+
+def test_after_a_callback_has_stopped_learn_it_continues_with_a_new_episode(make):
+    """The step at which it stopped is not stored, so the next one does not follow the last one stored."""
+
+    class Clock(Drawn):
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.full(1, self.time + 1, np.float32), *super().step(action)[1:]
+
+    model = make(Clock(spaces.Box(0, 10, (1,), np.float32)), learning_starts=1_000)
+    model.learn(100, callback=lambda found, _: found["self"].num_timesteps < 15)
+    model.learn(5, reset_num_timesteps=False)
+    buffer, rows = model.replay_buffer, np.arange(19)
+    now, then = (buffer._stores[""].observations(rows, 0 * rows, following=f)[:, 0].tolist() for f in (False, True))
+    assert now == [*range(10), *range(4), *range(5)] and then == [n + 1 for n in now]
+    assert np.flatnonzero(buffer.timeouts[:19, 0]).tolist() == [9, 13]  # no return crosses the interruption
 
 
 def test_predict_shapes(make):
