@@ -9,6 +9,7 @@ import pytest
 import torch as th
 import yaml
 
+from benchmarks import ablation
 from benchmarks.probes import explained, probe
 from benchmarks.trials import check_names, merged, table
 from sb3_eqr import EqRQRDQN
@@ -40,6 +41,29 @@ def test_the_table_names_cells_with_fewer_seeds():
     assert table(rows, ["a"], ["Breakout", "Freeway"], 10).splitlines()[2] == (
         "| a | 2 | 2.00 ± 1.00, 0.50 ± 0.00 | 4.00, 0.50 (1) | 7 |"
     )
+
+
+def test_the_ablation_compares_with_the_entry_game_by_game(tmp_path):
+    """
+    Of one component 1.5 and 0.5 times the entry's mean score on the two games, 1 on average, whatever the games' units. A seed
+    that has run on one game only does not count. All seeds of a game are equal, so the interval is a point.
+    """
+    scores = {"recipe": (2.0, 40.0), "get": (3.0, 20.0)}
+    rows = [
+        {"trial": trial, "game": game, "seed": seed, "score": score, "curve": [0.0, 10.0], "skill": [0.9, 0.5]}
+        for trial, both in scores.items()
+        for game, score in zip(ablation.GAMES, both, strict=True)
+        for seed in (0, 1)
+    ]
+    rows.append({**rows[0], "seed": 2, "score": 1e6})
+    trials = {name: [row for row in rows if row["trial"] == name] for name in scores}
+    assert ablation.matrix(trials["recipe"], "score").tolist() == [[2.0, 40.0]] * 2
+    assert ablation.table(trials).splitlines()[2:] == [
+        "| the entry | 2 | 2.00 ± 0.00 | 40.00 ± 0.00 | 1 | 1 | 0.90, 0.50 |",
+        "| GET loss only | 2 | 3.00 ± 0.00 | 20.00 ± 0.00 | 1.00 [1.00, 1.00] | 1.00 [1.00, 1.00] | 0.90, 0.50 |",
+    ]
+    ablation.draw(trials, tmp_path / "ablation.png")
+    assert (tmp_path / "ablation.png").stat().st_size > 1_000
 
 
 def test_a_failed_trial_is_an_error(tmp_path):
