@@ -25,6 +25,7 @@ NAMES = {
     "contrastive": "EqR, contrastive AET loss",
     "distance": "EqR without predictor",
     "no_group": "EqR without a group",
+    "no_aet": "EqR without the AET loss",
     "plain": "Q-learning alone",
 }
 
@@ -61,7 +62,7 @@ def draw(rows: pathlib.Path, picture: pathlib.Path) -> None:
             axis.set(title=f"{WORLDS[game][1]['n_distractors']} distractors", xlabel="steps", ylim=(0, 100))
             axis.grid()
         axes[1].set_ylabel(f"goals reached per {STEPS // N_PARTS} steps")
-        figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=4)
+        figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=3)
         figure.savefig(picture, dpi=150)
         plt.close(figure)
 

@@ -19,11 +19,13 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import yaml
+from scipy.stats import ttest_ind
 
 GAMES = ("Breakout", "SpaceInvaders")  # for tuning; the other three are only for the final comparison
 WORLDS: dict[str, tuple[str, dict[str, Any]]] = {  # environments with a known symmetry: name -> id, arguments
@@ -242,6 +244,38 @@ def world_table(rows: list[dict[str, Any]], names: list[str], game: str, steps: 
     return "\n".join(lines)
 
 
+def differences(rows: list[dict[str, Any]], names: list[str], baseline: str, game: str, steps: int) -> str:
+    """
+    A Markdown table of the differences from another trial's means over seeds in an environment of ``WORLDS``, each with its
+    95 % interval (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28): goals reached or return of an episode in training,
+    return of the greedy policy's, R² of the state from the features.
+    """
+    measures: dict[str, Callable[[dict[str, Any]], float]] = {
+        "goals reached": lambda row: row["return_in_all"],
+        "return in training": lambda row: row["return_in_all"] / row["episodes"],
+        "greedy policy": lambda row: row["score"],
+        "R²": lambda row: row["probe"],
+    }
+    del measures["return in training" if "torus" in game else "goals reached"]
+    lines = [f"| compared with {baseline} | " + " | ".join(measures) + " |", "|---" * (len(measures) + 1) + "|"]
+    for name in names:
+        cells = []
+        for measure in measures.values():
+            both = [
+                [measure(row) for row in rows if (row["trial"], row["game"], row["steps"]) == (one, game, steps)]
+                for one in (name, baseline)
+            ]
+            if name != baseline and min(map(len, both)) > 1:
+                interval = ""
+                if max(map(np.ptp, both)) > 0:
+                    found = ttest_ind(*both, equal_var=False).confidence_interval()
+                    interval = f" [{found.low:.4g}, {found.high:.4g}]"
+                cells.append(f"{np.mean(both[0]) - np.mean(both[1]):.4g}{interval}")
+        if cells:
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Parse the command line, run what is missing, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -253,6 +287,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--jobs", type=int, default=2, help="parallel runs, one thread each")
     parser.add_argument("--table", action="store_true", help="print the table of finished runs, run nothing")
+    parser.add_argument("--baseline", metavar="NAME", help="also print the differences from this trial, in WORLDS")
     parser.add_argument("--one", nargs=3, metavar=("NAME", "GAME", "SEED"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     trials = yaml.safe_load(arguments.trials.read_text(encoding="utf-8"))
@@ -285,6 +320,8 @@ def main() -> None:
     for game in arguments.games:
         if "torus" in game:
             print(f"\n{game}\n", world_table(rows, names, game, arguments.steps), sep="\n")
+        if game in WORLDS and arguments.baseline:
+            print(f"\n{game}\n", differences(rows, names, arguments.baseline, game, arguments.steps), sep="\n")
     if failed:
         raise SystemExit(f"These runs failed, see their errors above: {', '.join(map(str, failed))}.")
 

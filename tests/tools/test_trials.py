@@ -11,7 +11,7 @@ import yaml
 
 from benchmarks import ablation
 from benchmarks.probes import explained, probe
-from benchmarks.trials import check_names, merged, table
+from benchmarks.trials import check_names, differences, merged, table
 from sb3_eqr import EqRQRDQN
 from tests.toys import ImageEnv
 
@@ -41,6 +41,23 @@ def test_the_table_names_cells_with_fewer_seeds():
     assert table(rows, ["a"], ["Breakout", "Freeway"], 10).splitlines()[2] == (
         "| a | 2 | 2.00 ± 1.00, 0.50 ± 0.00 | 4.00, 0.50 (1) | 7 |"
     )
+
+
+def test_differences_have_welch_intervals():
+    """
+    Goals 3 and 1 against 0 and 0: the difference 2 has the standard error √(2 / 2) = 1 and one degree of freedom, whose 97.5 %
+    quantile is tan(0.475 π) = 12.706. The last measures are constant.
+    """
+    rows = [
+        {**ROW, "trial": trial, "game": "torus", "seed": seed, "return_in_all": goals, "score": 1.0, "probe": probe}
+        for trial, values, probe in (("a", (3.0, 1.0), 0.75), ("b", (0.0, 0.0), 0.5))
+        for seed, goals in enumerate(values)
+    ]
+    assert differences(rows, ["a", "b"], "b", "torus", 10).splitlines() == [
+        "| compared with b | goals reached | greedy policy | R² |",
+        "|---|---|---|---|",
+        "| a | 2 [-10.71, 14.71] | 0 | 0.25 |",
+    ]
 
 
 def test_the_ablation_compares_with_the_entry_game_by_game(tmp_path):
