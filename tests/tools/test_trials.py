@@ -43,6 +43,17 @@ def test_the_table_names_cells_with_fewer_seeds():
     )
 
 
+def test_ratios_have_intervals_by_the_delta_method():
+    """
+    Ratios 1.5 and 0.5. Only the entry varies, and on one game, where its mean 2 has the variance 1: the ratio 1.5 has the
+    variance 1.5² · 1 / 2² = 0.5625, the average of two ratios a quarter of it, the standard deviation 0.375, and one degree of
+    freedom, whose 97.5 % quantile is 12.706.
+    """
+    changed, entry = np.array([[3.0, 20.0]] * 2), np.array([[1.0, 40.0], [3.0, 40.0]])
+    assert ablation.ratio(changed, entry) == pytest.approx((1.0, 1 - 0.375 * 12.7062, 1 + 0.375 * 12.7062), abs=1e-4)
+    assert ablation.ratio(changed[:1], entry) == (1.0, -np.inf, np.inf)
+
+
 def test_differences_have_welch_intervals():
     """
     Goals 3 and 1 against 0 and 0: the difference 2 has the standard error √(2 / 2) = 1 and one degree of freedom, whose 97.5 %
