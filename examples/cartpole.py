@@ -3,6 +3,7 @@ Train agents on CartPole-v1, with learning curves.
 
     python examples/cartpole.py --seeds 0 1 2 3 4                      # EqRQRDQN, 30,000 steps
     python examples/cartpole.py --agent eqr_rainbow --seeds 0 1 2 3 4  # EqRRainbow with the same settings
+    python examples/cartpole.py --agent without_eqr --seeds 0 1 2 3 4  # EqRQRDQN without group and losses
     python examples/cartpole.py --agent qrdqn --seeds 0 1 2 3 4        # sb3_contrib's QRDQN with the same settings
     python examples/cartpole.py --agent plain_rainbow --seeds 0 1 2 3 4    # EqRRainbow, all extensions off: a categorical DQN
     python examples/cartpole.py --agent dqn --seeds 0 1 2 3 4              # SB3's DQN with the same settings
@@ -68,6 +69,9 @@ def make_model(agent: str, seed: int) -> OffPolicyAlgorithm:
     """
     if agent == "eqr_qrdqn":
         return EqRQRDQN("MlpPolicy", "CartPole-v1", seed=seed, **SETTINGS)
+    if agent == "without_eqr":
+        network = {**SETTINGS["policy_kwargs"], "group": None}
+        return EqRQRDQN("MlpPolicy", "CartPole-v1", seed=seed, prediction_depth=0, **{**SETTINGS, "policy_kwargs": network})
     if agent == "eqr_rainbow":
         network = {"net_arch": [256, 256], "noisy": False, "v_min": 0.0, "v_max": 100.0}
         return EqRRainbow("MlpPolicy", "CartPole-v1", seed=seed, **{**SETTINGS, "policy_kwargs": network})
@@ -80,7 +84,14 @@ def make_model(agent: str, seed: int) -> OffPolicyAlgorithm:
     return EqRRainbow("MlpPolicy", "CartPole-v1", seed=seed, **DQN_SETTINGS, **OFF, policy_kwargs=network)
 
 
-STEPS_OF = {"eqr_qrdqn": STEPS, "eqr_rainbow": STEPS, "qrdqn": STEPS, "plain_rainbow": 50_000, "dqn": 50_000}
+STEPS_OF = {
+    "eqr_qrdqn": STEPS,
+    "eqr_rainbow": STEPS,
+    "without_eqr": STEPS,
+    "qrdqn": STEPS,
+    "plain_rainbow": 50_000,
+    "dqn": 50_000,
+}
 
 
 def train(agent: str, seed: int, steps: int) -> dict:
