@@ -18,6 +18,7 @@ from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projectio
 from sb3_eqr.common.networks.encoders import (
     DEFAULT_GROUP,
     ConvTrunk,
+    DictExtractor,
     GroupFeaturesExtractor,
     GroupLayer,
     ImageExtractor,
@@ -55,10 +56,11 @@ class EqRPolicy(BasePolicy):
     :param activation_fn: Activation function of the Q head
     :param features_extractor_class: the trunk, which the group encoder is put on top of. A class or a name: "nature" (the
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``), "mlp" (one layer of 256),
-        "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), SB3's ``CombinedExtractor`` (MultiInputPolicy)
+        "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), ``DictExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: keyword arguments of the trunk: those of
         :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", those of
-        :class:`~sb3_eqr.common.networks.encoders.ImpalaExtractor` for "impala"
+        :class:`~sb3_eqr.common.networks.encoders.ImpalaExtractor` for "impala", those of
+        :class:`~sb3_eqr.common.networks.encoders.DictExtractor` for dicts
     :param normalize_images: Whether to divide images by 255 (True by default)
     :param optimizer_class: The optimizer to use, or its name in ``torch.optim``; Adam by default
     :param optimizer_kwargs: its keyword arguments, excluding the learning rate. For Adam and AdamW, the agent's constructor
@@ -210,7 +212,7 @@ class EqRPolicy(BasePolicy):
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Create the trunk, with the group encoder on top of it if the Q head takes group elements."""
         trunk_kwargs = dict(self.features_extractor_kwargs)
-        if not self.normalize_images and issubclass(self.features_extractor_class, ImageExtractor):
+        if not self.normalize_images and issubclass(self.features_extractor_class, (ImageExtractor, DictExtractor)):
             trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
         is_encoder = issubclass(self.features_extractor_class, GroupFeaturesExtractor)
         if is_encoder and self.group is not None and self.head_input == "trunk":

@@ -5,12 +5,12 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import quantile_huber_loss
-from sb3_eqr.common.networks.encoders import ConvExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.policies import EqRPolicy
 
@@ -90,6 +90,6 @@ class CnnPolicy(EqRQRDQNPolicy):
 
 
 class MultiInputPolicy(EqRQRDQNPolicy):
-    """:class:`EqRQRDQNPolicy` for dict observations: the trunk is SB3's ``CombinedExtractor``. Same parameters."""
+    """:class:`EqRQRDQNPolicy` for dict observations: each image has the paper's convolutions. Same parameters."""
 
-    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = DictExtractor

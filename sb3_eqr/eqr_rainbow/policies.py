@@ -4,13 +4,13 @@ from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_eqr.common.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import categorical_loss, categorical_projection
-from sb3_eqr.common.networks.encoders import ConvExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
 from sb3_eqr.common.policies import EqRPolicy
 
@@ -142,6 +142,6 @@ class CnnPolicy(EqRRainbowPolicy):
 
 
 class MultiInputPolicy(EqRRainbowPolicy):
-    """:class:`EqRRainbowPolicy` for dict observations: the trunk is SB3's ``CombinedExtractor``. Same parameters."""
+    """:class:`EqRRainbowPolicy` for dict observations: each image has the paper's convolutions. Same parameters."""
 
-    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = DictExtractor

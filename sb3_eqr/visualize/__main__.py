@@ -111,7 +111,7 @@ def main() -> None:
     try:
         run(args)
     except (ValueError, ImportError, OSError, gym.error.Error) as error:
-        fail(str(error))
+        fail(str(error).replace("trust=True", "--trust"))
 
 
 if __name__ == "__main__":

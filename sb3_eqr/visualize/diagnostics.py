@@ -26,13 +26,14 @@ from sb3_eqr.visualize.measures import Rewards, Transition
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
-    "predicts": "The latent model predicts: {errors}. Nothing needs to be done{unless}.",
+    "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show: "
+    "docs/faq.md.",
     "does not predict": "The latent model does not predict: {errors}. Train longer, with prediction_depth and aet_coef above "
     "0; if that does not help, transition.csv shows at which step it fails.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
 }
-UNLESS = ', unless you use the latent states themselves: then train with policy_kwargs=dict(projection="none")'
+UNLESS = '. To use the latent states themselves, train with policy_kwargs=dict(projection="none")'
 COLLAPSED = 1e-3  # squared distance on the unit sphere: directions within two degrees of each other
 
 

@@ -5,10 +5,14 @@ import pickle
 from copy import deepcopy
 
 import cloudpickle
+import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from torch.nn import functional as F
 
 from sb3_eqr import GroupFeaturesExtractor
 from tests.models import EITHER, MAKERS
@@ -112,6 +116,22 @@ def test_the_group_encoder_passes_features_dim_to_its_trunk():
     assert encoder.group_layer.to_algebra.in_features == 24 and encoder.features_dim == 12
     nature = GroupFeaturesExtractor(ImageEnv((3, 40, 36)).observation_space, trunk_class=NatureCNN, features_dim=24)
     assert nature.trunk.features_dim == 24
+
+
+@EITHER
+def test_dicts_may_hold_small_images(make):
+    space = spaces.Dict({"image": spaces.Box(0, 255, (3, 10, 10), np.uint8), "place": spaces.Box(-1, 1, (3,), np.float32)})
+    env = TransformObservation(ChainEnv(), lambda place: {"image": np.full((3, 10, 10), 7, np.uint8), "place": place}, space)
+    network = {"features_extractor_kwargs": {"layers": [[16, 3, 1]], "cnn_output_dim": 24}}
+    trunk = trunk_of(make(env, "MultiInputPolicy", policy_kwargs=network, shift_pixels=0).learn(50))
+    observations = {"image": th.rand(2, 3, 10, 10), "place": th.rand(2, 3)}
+    convolution, linear = trunk.extractors["image"].trunk[0], trunk.extractors["image"].linear[0]
+    patches = F.unfold(observations["image"], 3)  # (2, 27, 64): the convolution as a product of matrices
+    maps = (convolution.weight.flatten(1) @ patches + convolution.bias[:, None]).relu().flatten(1)
+    parts = {**observations, "image": (maps @ linear.weight.T + linear.bias).relu()}
+    th.testing.assert_close(trunk(observations), th.cat([parts[key] for key in space.spaces], dim=1))
+    with pytest.raises(ValueError, match="at least 36x36"):
+        make(env, "MultiInputPolicy")
 
 
 class Own(BaseFeaturesExtractor):

@@ -261,6 +261,16 @@ def test_command_line(trained, sb3_eqr, tmp_path):
         assert Image.open(tmp_path / "out" / f"{name}.png").size == (900, 600)
 
 
+class Pickled(th.nn.ReLU):
+    """Not plain data, so a file that names it needs trust."""
+
+
+def test_an_error_names_the_flag_of_the_command(sb3_eqr, tmp_path):
+    make_model(network={"activation_fn": Pickled}).save(tmp_path / "ring")
+    code, out = sb3_eqr(tmp_path / "ring.zip", "--env", "Ring-v0")
+    assert code == 2 and "pass --trust, or pass custom_objects" in out.err
+
+
 def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "rl_zoo3.import_envs", raising=False)
     folder = tmp_path / "Ring-v0_1" / "Ring-v0"

@@ -8,7 +8,8 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
@@ -144,8 +145,8 @@ class ImageExtractor(BaseFeaturesExtractor):
         if min(height, width) < smallest:
             raise ValueError(
                 f"Images must have at least {smallest}x{smallest} pixels, got {height}x{width}. "
-                'Pass smaller filters, such as policy_kwargs=dict(features_extractor_class="nature", '
-                "features_extractor_kwargs=dict(layers=[[16, 3, 1]])), and shift_pixels=0: docs/own_environment.md."
+                "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])), "
+                "and shift_pixels=0: docs/own_environment.md."
             )
         trunk = make_trunk(channels)
         with th.no_grad():
@@ -223,6 +224,38 @@ class MlpExtractor(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
+class DictExtractor(BaseFeaturesExtractor):
+    """
+    SB3's ``CombinedExtractor`` with the convolutions of :class:`ConvExtractor`, so that images may be small.
+
+    :param observation_space: a ``Dict``; everything but images is flattened
+    :param cnn_output_dim: size of the linear layer with a ReLU after the convolutions of each image
+    :param normalized_image: as in :class:`ImageExtractor`
+    :param layers: as in :class:`ConvExtractor`, the same for every image
+    :raises ValueError: if an image is too small for the layers
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        cnn_output_dim: int = 256,
+        normalized_image: bool = False,
+        layers: Sequence[Sequence[int]] = NATURE_LAYERS,
+    ):
+        extractors: dict[str, BaseFeaturesExtractor] = {}
+        for key, space in observation_space.spaces.items():
+            if is_image_space(space, normalized_image=normalized_image):
+                extractors[key] = ConvExtractor(space, cnn_output_dim, normalized_image, layers)  # type: ignore[arg-type]
+            else:
+                extractors[key] = FlattenExtractor(space)
+        super().__init__(observation_space, sum(extractor.features_dim for extractor in extractors.values()))
+        self.extractors = nn.ModuleDict(extractors)
+
+    def forward(self, observations: TensorDict) -> th.Tensor:
+        """Map a dict of (B, ...) to (B, features_dim)."""
+        return th.cat([extractor(observations[key]) for key, extractor in self.extractors.items()], dim=1)
+
+
 # Names for use in YAML files.
 TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {
     "nature": ConvExtractor,
@@ -242,9 +275,9 @@ def find_trunk(trunk: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExt
 
 
 def default_trunk(observation_space: spaces.Space, normalized_image: bool) -> type[BaseFeaturesExtractor]:
-    """The paper's convolutions for images (already floats if ``normalized_image``), SB3's extractors otherwise."""
+    """The paper's convolutions for images (floats if ``normalized_image``), also in dicts, SB3's extractor otherwise."""
     if isinstance(observation_space, spaces.Dict):
-        return CombinedExtractor
+        return DictExtractor
     is_image = is_image_space(observation_space, normalized_image=normalized_image)
     return ConvExtractor if is_image else FlattenExtractor
 
@@ -331,7 +364,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     :param center: whether to subtract their running mean before the layer norm; unused without layer norm. The agents of this
         package update that mean after each gradient step (``Centering.update``); others, such as SB3's, do not
     :param trunk_class: features extractor before the linear layer, or its name in ``TRUNKS``; ``None``: the
-        paper's convolutions for images, SB3's extractors otherwise
+        paper's convolutions for images, also in dicts, SB3's extractor otherwise
     :param trunk_kwargs: its keyword arguments
     :param normalized_image: as in SB3's extractors: images are already floats; passed to the default trunk
     :param features_dim: size of the trunk's features, as in SB3's extractors; ``None``: the trunk's own default
@@ -356,7 +389,7 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         trunk_kwargs = dict(trunk_kwargs or {})
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
         is_default = trunk_class is None and found is not FlattenExtractor
-        if is_default or (normalized_image and issubclass(found, ImageExtractor)):
+        if is_default or (normalized_image and issubclass(found, (ImageExtractor, DictExtractor))):
             trunk_kwargs.setdefault("normalized_image", normalized_image)
         if features_dim is not None:
             trunk_kwargs["features_dim"] = features_dim
