@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from benchmarks.atari_on_gpu import table
 from benchmarks.workload import EQR_AGENTS
 from tests.tools.test_package import ROOT
 
@@ -48,3 +49,38 @@ def test_a_run_is_resumed(tmp_path):
     assert first["steps"] == 1 and first["updates"] == 0
     assert second["steps"] == 60 and second["updates"] == 60 and second["seconds"] > first["seconds"]  # 30 steps, two each
     assert third == second  # the run was already finished
+
+
+def test_scores_of_several_runs_are_compared_by_part_of_the_training():
+    """By hand: means 1, 3 and 5, 7, so both standard errors are 1, and Welch's interval has 2 degrees of freedom."""
+    games = {("a", 0): [(9_000, 0.0), (20_000, 2.0), (25_000, 9.0)], ("a", 1): [(10_000, 3.0)], ("b", 0): [(1, 5.0)]}
+    games["b", 1] = [(19_999, 7.0)]
+    rows = [{"settings": name, "seed": seed, "steps": 25_000, "games": found} for (name, seed), found in games.items()]
+    lines = table(rows, ["a", "b"]).splitlines()
+    assert lines[2] == "| 0 to 20,000 | 2.0 ± 1.0 (1.0, 3.0) | 6.0 ± 1.0 (5.0, 7.0) | -4.0 [-10.1, 2.1] |"  # t is 4.303
+    # The game of b that ended at step 1 is too early for the last 20,000 steps.
+    assert lines[3] == "| 5,000 to 25,000 | 3.3 ± 0.3 (3.7, 3.0) | 7.0 |  |"
+    assert len(lines) == 4  # no run reached 40,000
+
+
+@pytest.mark.slow
+def test_several_runs_write_one_file(tmp_path):
+    command = [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-m",
+        "benchmarks.atari_on_gpu",
+        str(tmp_path / "rows.jsonl"),
+        "--device",
+        "cpu",
+    ]
+    command += ["--settings", "defaults", "defaults_off", "--steps", "2002"]
+    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
+    assert [(row["settings"], row["steps"], row["updates"], len(row["games"])) for row in rows] == [
+        ("defaults", 2002, 2, 1),
+        ("defaults_off", 2002, 2, 1),
+    ]
