@@ -243,13 +243,13 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     )
     if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
         model.load_replay_buffer(checkpoint / checkpoints.BUFFER)
-        buffer = model.replay_buffer
-        if not is_exact and hasattr(buffer, "timeouts"):  # no n-step return across the gap
-            buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
-    env = model.get_env()
-    assert env is not None
-    checkpoints.restore_environment(env, checkpoint, wrappers_only=not is_exact)
+    is_exact = checkpoints.restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact)
     if not is_exact:
+        buffer = getattr(model, "replay_buffer", None)
+        if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
+            buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
+        env = model.get_env()
+        assert env is not None
         env.seed((model.seed or 0) + model.num_timesteps)  # not the episodes from the start again
     checkpoints.restore_generators(model, manifest)
     return model, decode(manifest["notes"]), is_exact

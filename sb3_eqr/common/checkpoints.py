@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.arguments import ALGORITHM, check, integer
-from sb3_eqr.common.env_state import CLASS, capture, restore
+from sb3_eqr.common.env_state import CLASS, MissingObjectError, capture, restore
 from sb3_eqr.common.files import atomic_folder, checksum, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
@@ -120,11 +120,31 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     return found, manifest
 
 
-def restore_environment(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bool) -> None:
+def restore_environment(model: BaseAlgorithm, checkpoint: pathlib.Path, manifest: dict[str, Any], wrappers_only: bool) -> bool:
     """
-    Restore the state of an environment that is built like that of the checkpoint; with ``wrappers_only``, restore only the
-    state of its vectorised wrappers, such as the statistics of VecNormalize.
+    Restore the state of an environment that is built like that of the checkpoint. If a part of it cannot be restored, only the
+    state of its vectorised wrappers is, such as the statistics of VecNormalize, and the agent begins a new episode.
+
+    :param model: the loaded agent, with its environment
+    :param checkpoint: the checkpoint
+    :param manifest: its manifest; what is found to be missing is added to its "hidden"
+    :param wrappers_only: whether to restore the wrappers only
+    :return: whether all was restored
     """
+    env = model.get_env()
+    assert env is not None
+    if not wrappers_only:
+        try:
+            _restore(env, checkpoint, wrappers_only=False)
+            return True
+        except MissingObjectError as error:
+            manifest["hidden"].append(error.path)
+    _restore(env, checkpoint, wrappers_only=True)
+    model._last_obs = None  # so that learn resets the environment
+    return False
+
+
+def _restore(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bool) -> None:
     env.reset()  # some environments create their attributes only here
     state = json.loads((checkpoint / ENVIRONMENT).read_text(encoding="utf-8"))
     innermost = state

@@ -32,7 +32,7 @@ from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
 # Arguments of the replay buffer that the algorithm sets and changes.
-SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth")
+SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth", "buffer_size", "device")
 MAX_LEARNING_STARTS = 2_000  # Table 5, of 100,000 steps
 
 
@@ -237,6 +237,9 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph
         self.objective = Objective(self.policy, *self._options[:-1])
         self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
+        # The target is equal to the online network for one update per interval, for which a graph would be captured again.
+        is_captured = self._captured is not None and self._captured.failure is None
+        self.policy.shares_passes = not (is_captured and self.target_update_interval)
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)
@@ -260,7 +263,16 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     def _check_losses(self) -> None:
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        if getattr(self, "representation_frozen", False):
+            self._check_losses_of_frozen()
         validation.check_whitening(self.policy_kwargs.get("whiten", False), self.batch_size)
+
+    def _check_losses_of_frozen(self) -> None:
+        if self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):
+            raise ValueError(
+                "td_coef must be > 0 with a frozen representation and no reward loss, because nothing that uses the "
+                "representation would be trained, got 0. Pass td_coef > 0, or freeze=False."
+            )
 
     def _check_losses_of_policy(self) -> None:
         self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
@@ -276,6 +288,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         with validation.environment_errors(0):
             wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         validation.check_action_space(wrapped.action_space)
+        validation.check_observation_space(wrapped.observation_space)
         return wrapped
 
     def _make_policy(self) -> EqRPolicy:
@@ -309,8 +322,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         if self._options != (self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph):
             self._set_up_objective()
         result = super()._setup_learn(*args, **kwargs)
-        if self.learning_starts is None:
-            self.learning_starts = min(self._total_timesteps // 10, MAX_LEARNING_STARTS)
+        if self.learning_starts is None and self._total_timesteps > 0:
+            self.learning_starts = min(int(self._total_timesteps) // 10, MAX_LEARNING_STARTS)
         validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)
         return result
 
@@ -443,13 +456,11 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param path: file written by ``save`` of either agent
         :param freeze: whether to freeze them; ``aet_coef=0, symmetry_coef=0`` then saves computing time
         :return: the agent
-        :raises ValueError: if the group, the trunk or the number of actions differs; nothing is changed in this case
+        :raises ValueError: if the group, the trunk or the number of actions differs, or ``freeze`` leaves nothing to train;
+            nothing is changed in this case
         """
-        if freeze and self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):
-            raise ValueError(
-                "freeze must be False if no other parameters are trained, got True with td_coef=0 and no reward loss. "
-                "Pass freeze=False."
-            )
+        if freeze:
+            self._check_losses_of_frozen()
         self._log_last_round()
         load_representation(self.policy, path)
         self.representation_frozen = freeze

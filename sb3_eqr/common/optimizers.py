@@ -8,15 +8,25 @@ from torch import nn
 from sb3_eqr.common.networks.layers import NoisyLinear
 
 ADAM_EPS = 1.5e-4  # Table 5
+UNFIT = {  # optimisers of torch.optim that cannot train these networks
+    "LBFGS": "it evaluates the loss several times per step",
+    "SparseAdam": "its gradients must be sparse",
+    "Muon": "it trains matrices only",
+}
 
 
 def find_optimizer(optimizer: str | type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
-    """Resolve an optimiser given as a class or by its name in ``torch.optim``; raises ValueError for an unknown name."""
-    if not isinstance(optimizer, str):
-        return optimizer
-    found = getattr(th.optim, optimizer, None)
+    """
+    Resolve an optimiser given as a class or by its name in ``torch.optim``; raises ValueError for an unknown name, or for an
+    optimiser that cannot train these networks.
+    """
+    found = getattr(th.optim, optimizer, None) if isinstance(optimizer, str) else optimizer
     if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
         raise ValueError(f"optimizer_class must be a class or a name in torch.optim such as 'AdamW', got {optimizer!r}.")
+    if found.__module__.startswith("torch.optim") and found.__name__ in UNFIT:
+        raise ValueError(
+            f"optimizer_class must not be {found.__name__}, because {UNFIT[found.__name__]}. Pass, for example, 'AdamW'."
+        )
     return found
 
 

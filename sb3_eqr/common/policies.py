@@ -25,6 +25,7 @@ from sb3_eqr.common.networks.encoders import (
     MlpExtractor,
     NormalizedExtractor,
     find_trunk,
+    make_trunk,
 )
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead, Whitening
 from sb3_eqr.common.networks.q_networks import EqRNetwork
@@ -113,6 +114,7 @@ class EqRPolicy(BasePolicy):
     own_projection_target: nn.Linear | None
     latent_network_target: EqRNetwork | None
     state_dim: int  # D: size of the latent state
+    shares_passes = True  # whether networks that are equal encode a batch once
 
     def __init__(
         self,
@@ -220,8 +222,9 @@ class EqRPolicy(BasePolicy):
                 'features_extractor_class must be a trunk if head_input="trunk", got a group encoder. Pass head_input="state".'
             )
         if self.group is None or self.head_input == "trunk":
-            trunk = self.features_extractor_class(self.observation_space, **trunk_kwargs)
-            return NormalizedExtractor(trunk, self.center) if self.layer_norm else trunk
+            return make_trunk(
+                self.features_extractor_class, self.observation_space, trunk_kwargs, self.layer_norm, self.center
+            )
         group_kwargs = {name: getattr(self, name) for name in ("layer_norm", "center")} | self._group_kwargs
         group_kwargs["normalized_image"] = not self.normalize_images
         if is_encoder:
@@ -334,12 +337,13 @@ class EqRPolicy(BasePolicy):
     @property
     def target_encodes_as_online(self) -> bool:
         """Whether the target encoder of the Q head gives the same features as the online one, so that one pass suffices."""
-        return self.target_copy.is_exact and self._encoder_ignores_mode
+        return self.shares_passes and self.target_copy.is_exact and self._encoder_ignores_mode
 
     @property
     def latent_target_encodes_as_online(self) -> bool:
         """The same for the latent model's target."""
-        return self.latent_target_copy.is_exact and self._states_ignore_mode
+        shares_passes = self.shares_passes or self.latent_target_copy is not self.target_copy
+        return shares_passes and self.latent_target_copy.is_exact and self._states_ignore_mode
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """As PyTorch's ``load_state_dict``, with the same parameters."""

@@ -211,13 +211,11 @@ class SafeFiles(OffPolicyAlgorithm):
             raise ValueError("env must be an environment, built as in the original run, got None.")
         checkpoint, manifest = read_manifest(pathlib.Path(path))
         is_exact = not manifest["hidden"]
-        if not is_exact:
-            warn_of_hidden(checkpoint, manifest)
         model = cls.load(checkpoint / MODEL, env, device, force_reset=not is_exact, trust=trust)
         if (checkpoint / BUFFER).is_file():
             model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
-        assert model.env is not None
-        restore_environment(model.env, checkpoint, wrappers_only=not is_exact)
+        if not restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact):
+            warn_of_hidden(checkpoint, manifest)
         restore_generators(model, manifest)
         return model
 

@@ -149,6 +149,23 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
 
 
+def check_observation_space(observation_space: spaces.Space, name: str = "observation_space") -> None:
+    """Raise ValueError if it, or a space in a dict, has no axis, or is Discrete and does not start at 0."""
+    if isinstance(observation_space, spaces.Dict):
+        for key, space in observation_space.spaces.items():
+            check_observation_space(space, f"observation_space[{key!r}]")
+    if isinstance(observation_space, spaces.Discrete) and observation_space.start != 0:
+        raise ValueError(
+            f"{name} must start at 0, because SB3 encodes it as one-hot, got {observation_space}. "
+            "Wrap the environment with gymnasium.wrappers.TransformObservation."
+        )
+    if isinstance(observation_space, spaces.Box) and observation_space.shape == ():
+        raise ValueError(
+            f"{name} must have at least one axis, got {observation_space}. "
+            "Wrap the environment with gymnasium.wrappers.ReshapeObservation and the shape (1,)."
+        )
+
+
 def check_device(device: Any) -> None:
     """Raise ValueError if this is not a device of PyTorch; warn if there is no GPU, because SB3 then uses the CPU."""
     try:
@@ -184,6 +201,9 @@ def check_normalization(normalize: VecNormalize | None, observation_space: space
         )
 
 
+OF_ENV = ("observation_space", "action_space", "n_envs")  # arguments of replay buffers
+
+
 def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], set_by_owner: Iterable[str]) -> None:
     """Raise ValueError if the class is not derived from ``base``, or ``kwargs`` contains arguments that the algorithm sets."""
     if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, base)):
@@ -191,11 +211,11 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
             f"replay_buffer_class must be {base.__name__} or a class derived from it, got {chosen}. "
             "Leave it out to let prioritized_replay choose the class."
         )
-    for name in set_by_owner:
+    for name in (*set_by_owner, *OF_ENV):
         if name in kwargs:
+            remedy = "Leave it out: it follows from env." if name in OF_ENV else f"Pass {name}={kwargs[name]!r} to {owner}."
             raise ValueError(
-                f"replay_buffer_kwargs must not contain arguments that {owner} sets itself, got "
-                f"{name!r}. Pass {name}={kwargs[name]!r} to {owner}."
+                f"replay_buffer_kwargs must not contain arguments that {owner} sets itself, got {name!r}. {remedy}"
             )
 
 
@@ -226,9 +246,9 @@ def check_whitening(whiten: bool, batch_size: int) -> None:
         )
 
 
-def warn_of_idle_training(last_step: int, learning_starts: int, n_updates: int, buffer: Any) -> None:
+def warn_of_idle_training(last_step: int, learning_starts: int | None, n_updates: int, buffer: Any) -> None:
     """Warn if a call of ``learn`` makes no updates, or if a trained agent has no replay buffer."""
-    if learning_starts >= last_step > 0:
+    if learning_starts is not None and learning_starts >= last_step > 0:
         warnings.warn(
             f"learning_starts={learning_starts} is not smaller than the last step, {last_step}, so no updates will be made. "
             "Pass a smaller learning_starts, or learn for more steps."

@@ -125,13 +125,35 @@ def test_dicts_may_hold_small_images(make):
     network = {"features_extractor_kwargs": {"layers": [[16, 3, 1]], "cnn_output_dim": 24}}
     trunk = trunk_of(make(env, "MultiInputPolicy", policy_kwargs=network, shift_pixels=0).learn(50))
     observations = {"image": th.rand(2, 3, 10, 10), "place": th.rand(2, 3)}
-    convolution, linear = trunk.extractors["image"].trunk[0], trunk.extractors["image"].linear[0]
+    convolution, linear, mlp = trunk.images["image"].trunk[0], trunk.images["image"].linear[0], trunk.mlp[0]
     patches = F.unfold(observations["image"], 3)  # (2, 27, 64): the convolution as a product of matrices
     maps = (convolution.weight.flatten(1) @ patches + convolution.bias[:, None]).relu().flatten(1)
-    parts = {**observations, "image": (maps @ linear.weight.T + linear.bias).relu()}
-    th.testing.assert_close(trunk(observations), th.cat([parts[key] for key in space.spaces], dim=1))
+    parts = [maps @ linear.weight.T + linear.bias, observations["place"] @ mlp.weight.T + mlp.bias]
+    th.testing.assert_close(trunk(observations), th.cat(parts, dim=1).relu())
     with pytest.raises(ValueError, match="at least 36x36"):
         make(env, "MultiInputPolicy")
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-1, 1, (1,), np.float32), spaces.Dict({"x": spaces.Box(-1, 1, (1,), np.float32)})]
+)
+def test_features_of_a_single_number_depend_on_it(make, space):
+    """A layer norm of the number itself would give 0."""
+
+    class OneNumber(ChainEnv):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = space
+
+        def observe(self):
+            found = super().observe()[:1]
+            return {"x": found} if isinstance(space, spaces.Dict) else found
+
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    model = make(OneNumber(), policy)
+    values = th.linspace(-1, 1, 9)[:, None]
+    features = model.policy.online.features_extractor({"x": values} if isinstance(space, spaces.Dict) else values)
+    assert features.var(dim=0).sum() > 0.1
 
 
 class Own(BaseFeaturesExtractor):

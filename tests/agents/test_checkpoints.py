@@ -110,6 +110,26 @@ def test_an_environment_state_that_cannot_be_saved_warns(tmp_path):
     model.learn(10, reset_num_timesteps=False)
 
 
+class GrowingEnv(ChainEnv):
+    """Creates an object in each step."""
+
+    def __init__(self):
+        super().__init__()
+        self.things = []
+
+    def step(self, action):
+        self.things.append(ChainEnv())
+        return super().step(action)
+
+
+def test_an_environment_that_creates_objects_is_resumed_with_new_episodes(tmp_path):
+    EqRQRDQN("MlpPolicy", GrowingEnv(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
+    with pytest.warns(UserWarning, match=r"cannot be saved \(.*things\[0\].*new episodes"):
+        model = EqRQRDQN.resume(tmp_path, GrowingEnv())
+    assert model._last_obs is None
+    model.learn(20, reset_num_timesteps=False)
+
+
 @pytest.mark.parametrize("wrong", [{"save_freq": 0}, {"save_freq": 1.5}, {"keep": 0}])
 def test_callback_arguments(wrong, tmp_path):
     with pytest.raises(ValueError, match=r"must be an integer >= 1, got"):

@@ -111,7 +111,7 @@ def test_files_that_are_not_agents(tmp_path):
     (tmp_path / "cut.zip").write_bytes(b"PK")
     with pytest.raises(ValueError, match="must be a complete file"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
-    with pytest.raises(ValueError, match="freeze must be False"):
+    with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
         QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
 
 

@@ -1,15 +1,19 @@
 """The state of an environment, captured and restored into another one built in the same way: both then behave the same."""
 
+import dataclasses
+import enum
 import json
+import random
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import envs
-from sb3_eqr.common.env_state import capture, restore
+from sb3_eqr.common.env_state import MissingObjectError, capture, restore
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.toys import ChainEnv, ImageEnv
 
@@ -64,6 +68,91 @@ def test_original_and_restored_environment_behave_the_same(name):
     restore(second, json.loads(text))
     for (a, b, c, d), (e, f, g, h) in zip(play(first, actions[37:]), play(second, actions[37:]), strict=True):
         assert np.array_equal(a, e) and np.array_equal(b, f) and np.array_equal(c, g) and d == h
+
+
+class Phase(enum.Enum):
+    DAY, NIGHT = "day", "night"
+
+
+class Tool(enum.IntEnum):
+    NONE, KEY = 0, 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    size: int
+    field: np.ndarray
+
+
+class Room:
+    def __init__(self, name):
+        self.name, self.light = name, 0
+
+
+class House:
+    """An environment with state of many kinds."""
+
+    def __init__(self):
+        self.rng, self.weights = random.Random(3), th.zeros(2)
+        self.phase, self.tool = Phase.DAY, Tool.NONE
+        self.settings = Settings(4, np.zeros(2))
+        self.rooms = [Room("hall"), Room("kitchen")]
+        self.room = self.rooms[0]
+        self.grid = np.zeros(3)
+        self.shown = self.grid
+        self.by_phase = {None: 0, ("a", 1): 2}
+        self.myself = self
+
+    def live(self):
+        self.rng.random()
+        self.weights = self.weights + 1.5
+        self.phase, self.tool = Phase.NIGHT, Tool.KEY
+        self.room = self.rooms[1]
+        self.room.light += 1
+        self.settings.field[:] = 7
+        self.grid[1] = 5
+        self.by_phase[None] = 9
+
+
+def moved(house):
+    text = json.dumps(capture(house)[0])
+    assert '": "pickle"' not in text
+    fresh = House()
+    restore(fresh, json.loads(text))
+    return fresh
+
+
+def test_values_of_many_kinds_are_restored():
+    house = House()
+    house.live()
+    assert capture(house)[1] == []
+    other = moved(house)
+    assert other.rng.random() == house.rng.random()
+    assert other.weights.tolist() == [1.5, 1.5]
+    assert other.phase is Phase.NIGHT and other.tool is Tool.KEY and [phase.value for phase in Phase] == ["day", "night"]
+    assert other.room is other.rooms[1] and [room.light for room in other.rooms] == [0, 1]
+    assert other.settings.size == 4 and other.settings.field.tolist() == [7, 7]
+    assert other.shown is other.grid and other.grid.tolist() == [0, 5, 0]
+    assert other.by_phase == {None: 9, ("a", 1): 2} and other.myself is other
+
+
+def test_objects_that_only_the_original_run_created_are_named():
+    house = House()
+    house.rooms.append(Room("attic"))
+    with pytest.raises(MissingObjectError, match=r"House.rooms\[2\] must be an object, got nothing"):
+        moved(house)
+
+
+def test_objects_with_state_in_c_are_named():
+    class Queue(bytearray):
+        pass
+
+    class Slotted:
+        __slots__ = ("__dict__", "speed")
+
+    house = House()
+    house.queue, house.slotted, house.plain = Queue(b"ab"), Slotted(), Room("x")
+    assert capture(house)[1] == [".queue", ".slotted"]
 
 
 def test_state_that_cannot_be_captured_is_named():

@@ -1,5 +1,6 @@
 """Features extractors: convolutional trunks, and the group encoder τ on top of a trunk."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import prod
@@ -226,12 +227,14 @@ class MlpExtractor(BaseFeaturesExtractor):
 
 class DictExtractor(BaseFeaturesExtractor):
     """
-    SB3's ``CombinedExtractor`` with the convolutions of :class:`ConvExtractor`, so that images may be small.
+    SB3's ``CombinedExtractor`` with the convolutions of :class:`ConvExtractor`, so that images may be small, and a layer for
+    everything else, because the scale of raw numbers would not survive a layer norm.
 
-    :param observation_space: a ``Dict``; everything but images is flattened
+    :param observation_space: a ``Dict``
     :param cnn_output_dim: size of the linear layer with a ReLU after the convolutions of each image
     :param normalized_image: as in :class:`ImageExtractor`
     :param layers: as in :class:`ConvExtractor`, the same for every image
+    :param mlp_output_dim: size of the linear layer with a ReLU that takes everything but images, flattened
     :raises ValueError: if an image is too small for the layers
     """
 
@@ -241,19 +244,26 @@ class DictExtractor(BaseFeaturesExtractor):
         cnn_output_dim: int = 256,
         normalized_image: bool = False,
         layers: Sequence[Sequence[int]] = NATURE_LAYERS,
+        mlp_output_dim: int = 256,
     ):
-        extractors: dict[str, BaseFeaturesExtractor] = {}
+        check_number("mlp_output_dim", mlp_output_dim, 1, whole=True)
+        images, others = {}, {}
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
-                extractors[key] = ConvExtractor(space, cnn_output_dim, normalized_image, layers)  # type: ignore[arg-type]
+                images[key] = ConvExtractor(space, cnn_output_dim, normalized_image, layers)  # type: ignore[arg-type]
             else:
-                extractors[key] = FlattenExtractor(space)
-        super().__init__(observation_space, sum(extractor.features_dim for extractor in extractors.values()))
-        self.extractors = nn.ModuleDict(extractors)
+                others[key] = FlattenExtractor(space)
+        super().__init__(observation_space, cnn_output_dim * len(images) + mlp_output_dim * bool(others))
+        self.images, self.others = nn.ModuleDict(images), nn.ModuleDict(others)
+        n_numbers = sum(flat.features_dim for flat in others.values())
+        self.mlp = nn.Sequential(nn.Linear(n_numbers, mlp_output_dim), nn.ReLU()) if others else None
 
     def forward(self, observations: TensorDict) -> th.Tensor:
         """Map a dict of (B, ...) to (B, features_dim)."""
-        return th.cat([extractor(observations[key]) for key, extractor in self.extractors.items()], dim=1)
+        features = [extractor(observations[key]) for key, extractor in self.images.items()]
+        if self.mlp is not None:
+            features.append(self.mlp(th.cat([flat(observations[key]) for key, flat in self.others.items()], dim=1)))
+        return th.cat(features, dim=1)
 
 
 # Names for use in YAML files.
@@ -302,6 +312,36 @@ class NormalizedExtractor(BaseFeaturesExtractor):
         return self.norm(self.center(self.trunk(observations)))
 
 
+def make_trunk(
+    trunk_class: type[BaseFeaturesExtractor],
+    observation_space: spaces.Space,
+    trunk_kwargs: dict[str, Any],
+    layer_norm: bool,
+    center: bool,
+) -> BaseFeaturesExtractor:
+    """
+    :param trunk_class: any features extractor
+    :param observation_space: its observations
+    :param trunk_kwargs: its other arguments
+    :param layer_norm: whether a :class:`NormalizedExtractor` follows
+    :param center: as in :class:`NormalizedExtractor`
+    :return: the trunk
+    :raises ValueError: if the trunk is for vectors and the observations are dicts
+    """
+    if issubclass(trunk_class, (MlpExtractor, FlattenExtractor)) and isinstance(observation_space, spaces.Dict):
+        raise ValueError(
+            f"features_extractor_class must accept dicts, got {trunk_class.__name__} for {observation_space}. "
+            "Use MultiInputPolicy and leave features_extractor_class out."
+        )
+    if layer_norm and issubclass(trunk_class, FlattenExtractor) and not isinstance(observation_space, spaces.Discrete):
+        warnings.warn(
+            "features_extractor_class='flatten' with layer_norm=True: the numbers of each observation are shifted and scaled "
+            "to mean 0 and variance 1, which loses information. Pass features_extractor_class='mlp', or layer_norm=False."
+        )
+    trunk = trunk_class(observation_space, **trunk_kwargs)
+    return NormalizedExtractor(trunk, center) if layer_norm else trunk
+
+
 class GroupLayer(nn.Module):
     """
     One linear layer to the Lie algebra, then K group elements, flattened (Eq. 13, appendix B.4).
@@ -333,6 +373,9 @@ class GroupLayer(nn.Module):
         self.group = made
         self.n_blocks = n_blocks
         self.state_dim = n_blocks * prod(made.element_shape)  # D
+        factors = [factor for factor, _ in made.factors] if isinstance(made, ProductGroup) else [made]
+        named = {factor.parameterization for factor in factors if hasattr(factor, "parameterization")}  # of objects, too
+        parameterization = ", ".join(sorted(named)) or parameterization
         self.description = f"{made}^{n_blocks}, {parameterization}"  # the parameters' shapes do not determine the group
         n_params = n_blocks * made.num_params
         self.to_algebra: nn.Module = nn.Linear(features_dim, n_params)
@@ -393,9 +436,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
             trunk_kwargs.setdefault("normalized_image", normalized_image)
         if features_dim is not None:
             trunk_kwargs["features_dim"] = features_dim
-        trunk = found(observation_space, **trunk_kwargs)
-        self.trunk: BaseFeaturesExtractor = NormalizedExtractor(trunk, center) if layer_norm else trunk
-        self.group_layer = GroupLayer(trunk.features_dim, group, n_blocks, parameterization, whiten)
+        self.trunk = make_trunk(found, observation_space, trunk_kwargs, layer_norm, center)
+        self.group_layer = GroupLayer(self.trunk.features_dim, group, n_blocks, parameterization, whiten)
         self._features_dim = self.group_layer.state_dim
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:

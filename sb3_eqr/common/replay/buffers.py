@@ -81,7 +81,9 @@ class SequenceReplayBuffer(ReplayBuffer):
             for key, space in obs_spaces.items()
         }
         shape = (self.buffer_size, n_envs)
-        self.actions = np.zeros((*shape, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
+        is_discrete = isinstance(action_space, spaces.Discrete)  # an index of PyTorch must be int64
+        dtype = np.int64 if is_discrete else self._maybe_cast_dtype(action_space.dtype)
+        self.actions = np.zeros((*shape, self.action_dim), dtype=dtype)
         self.rewards = np.zeros(shape, dtype=np.float32)
         self.dones = np.zeros(shape, dtype=np.float32)
         self.timeouts = np.zeros(shape, dtype=np.float32)
