@@ -245,7 +245,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
         model.load_replay_buffer(checkpoint / checkpoints.BUFFER)
     is_exact = checkpoints.restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact)
     if not is_exact:
-        buffer = getattr(model, "replay_buffer", None)
+        buffer: Any = getattr(model, "replay_buffer", None)
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
             buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
         env = model.get_env()

@@ -6,6 +6,7 @@ from datetime import timedelta
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
 from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
@@ -13,6 +14,7 @@ from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.eqr_qrdqn import EqRQRDQNPolicy
 from sb3_eqr.eqr_rainbow import EqRRainbowPolicy
+from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
 
 NOT_IN_A_TABLE = {
@@ -87,6 +89,29 @@ def test_attributes_set_later_are_checked_when_learning_starts(name):
     with pytest.raises(ValueError, match=f"{name} must be .*, got -1"):
         model.learn(20)
     assert model.num_timesteps == 0
+
+
+@EITHER
+def test_steps_may_be_a_float(make, tmp_path):
+    model = make(ChainEnv(), learning_starts=None).learn(2e2)
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model")
+    assert (model.learning_starts, loaded.learning_starts) == (20, 20) and isinstance(loaded.learning_starts, int)
+    model.learn(1e1, reset_num_timesteps=False)
+
+
+@EITHER
+def test_learning_nothing_does_not_choose_when_learning_starts(make):
+    assert make(ChainEnv(), learning_starts=None).learn(0).learn(200).learning_starts == 20
+
+
+@EITHER
+def test_actions_may_have_any_integer_type(make):
+    env = ChainEnv()
+    env.action_space = spaces.Discrete(3, dtype=np.int32)
+    model = make(env).learn(46)
+    samples = model.replay_buffer.sample(4)
+    assert model._n_updates > 0 and samples.actions.dtype == samples.rollout_actions.dtype == th.int64
 
 
 def test_combinations_of_attributes_set_later_are_checked_when_learning_starts():

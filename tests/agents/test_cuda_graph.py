@@ -1,5 +1,6 @@
 """Captured updates. With a GPU, the tests check the graph; without one, that updates need no GPU."""
 
+import itertools
 import pickle
 
 import numpy as np
@@ -9,6 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecFrameStack
 
+from sb3_eqr.common.cuda_graph import CapturedGradients
 from tests.models import EITHER, loss_terms
 from tests.toys import ChainEnv, ImageEnv
 
@@ -65,6 +67,27 @@ def test_the_objective_reads_no_number_from_the_device(make, policy, network):
 
 def same_within(a, b, tolerance):
     return all((x - y).abs().max() <= tolerance for x, y in zip(a.policy.parameters(), b.policy.parameters(), strict=True))
+
+
+@EITHER
+@pytest.mark.parametrize("kwargs", [{}, {"tau": 0.5}, {"target_update_interval": 8}], ids=str)
+def test_a_run_needs_few_graphs(make, kwargs, monkeypatch):
+    """With a stand-in for the graph, which only counts what it would be captured for."""
+
+    class Counting(CapturedGradients):
+        def __init__(self, *arguments):
+            monkeypatch.setattr(self, "_give_up", lambda why: None)
+            super().__init__(*arguments)
+            self.keys = []
+
+        def __call__(self, samples, coefs):
+            self.keys.append(self._key_of(samples, coefs))
+            return self._eager(samples, coefs)
+
+    monkeypatch.setattr("sb3_eqr.common.eqr_algorithm.CapturedGradients", Counting)
+    model = make(ChainEnv(), cuda_graph=True, **kwargs).learn(120)
+    keys = model._captured.keys
+    assert len(keys) > 50 and sum(a != b for a, b in itertools.pairwise(keys)) <= 1
 
 
 @pytest.mark.gpu

@@ -6,10 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from sb3_contrib.qrdqn.policies import QRDQNPolicy
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from benchmarks.attacks.inputs import wrong_arguments
@@ -71,6 +73,10 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
         ({"resets": {"interval": 0}}, "resets: interval must be an integer >= 1"),
         ({"resets": {"shrink_factor": 1.5}}, "shrink_factor"),
         ({"resets": {"end": -1}}, "resets: end"),
+        ({"policy_kwargs": {"optimizer_class": "LBFGS"}}, "optimizer_class must not be LBFGS"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.SparseAdam}}, "optimizer_class must not be SparseAdam"),
+        ({"replay_buffer_kwargs": {"n_envs": 7}}, "'n_envs'. Leave it out: it follows from env"),
+        ({"replay_buffer_kwargs": {"buffer_size": 3}}, "Pass buffer_size=3 to EqR"),
         (
             {"policy_kwargs": {"optimizer_class": "AdamV"}},
             "optimizer_class must be a class or a name in torch.optim.*'AdamV'",
@@ -85,6 +91,35 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 def test_arguments_out_of_range(make, kwargs, message):
     with pytest.raises(ValueError, match=message):
         make(ChainEnv(), **kwargs)
+
+
+@EITHER
+@pytest.mark.parametrize(
+    "space, message",
+    [
+        (spaces.Discrete(5, start=1), "observation_space must start at 0"),
+        (spaces.Box(-1, 1, (), np.float32), "observation_space must have at least one axis"),
+        (spaces.Dict({"a": spaces.Box(-1, 1, (), np.float32)}), r"observation_space\['a'\] must have at least one axis"),
+    ],
+)
+def test_observation_spaces_that_fit_no_network(make, space, message):
+    env = ChainEnv()
+    env.observation_space = space
+    with pytest.raises(ValueError, match=message):
+        make(env, "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy")
+
+
+@EITHER
+@pytest.mark.parametrize("trunk", ["mlp", "flatten"])
+def test_trunks_for_vectors_refuse_dicts(make, trunk):
+    with pytest.raises(ValueError, match=r"must accept dicts, got .*Use MultiInputPolicy and leave"):
+        make(SimpleMultiObsEnv(channel_last=False), "MultiInputPolicy", policy_kwargs={"features_extractor_class": trunk})
+
+
+@EITHER
+def test_a_layer_norm_of_the_observations_warns(make):
+    with pytest.warns(UserWarning, match="'flatten' with layer_norm=True.* loses information"):
+        make(ChainEnv(), policy_kwargs={"features_extractor_class": "flatten"})
 
 
 def test_the_minimum_buffer_size_is_per_environment(make):

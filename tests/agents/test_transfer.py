@@ -5,6 +5,7 @@ import pytest
 import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.common.groups import SO
 from sb3_eqr.common.transfer import representation
 from tests.models import BOTH, MAKERS, loss_terms
 from tests.toys import ChainEnv
@@ -113,6 +114,21 @@ def test_files_that_are_not_agents(tmp_path):
         QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
     with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
         QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
+
+
+def test_a_frozen_representation_needs_a_loss_that_uses_it(make, tmp_path):
+    make(ChainEnv()).save(tmp_path / "model")
+    model = make(ChainEnv()).load_representation(tmp_path / "model", freeze=True)
+    model.td_coef = model.reward_coef = 0.0
+    with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
+        model.learn(46)
+
+
+def test_a_group_given_as_an_object_is_compared_with_its_parameterization(tmp_path):
+    network = {"n_blocks": 2, "group": SO(3, "exp")}
+    QRDQN(ChainEnv(), policy_kwargs=network).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"must be for 'SO\(3\)\^2, euler', got parameters for 'SO\(3\)\^2, exp'"):
+        QRDQN(ChainEnv(), policy_kwargs={**network, "group": SO(3, "euler")}).load_representation(tmp_path / "model")
 
 
 @BOTH
