@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.arguments import ALGORITHM, check, integer
-from sb3_eqr.common.env_state import CLASS, MissingObjectError, capture, restore
+from sb3_eqr.common.env_state import CLASS, NUMBER, MissingObjectError, capture, restore
 from sb3_eqr.common.files import atomic_folder, checksum, remove_leftovers
 from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.random_state import get_rng_state, set_rng_state
@@ -151,7 +151,7 @@ def _restore(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bool) -> None
     while innermost.get("venv") is not None:
         innermost = innermost["venv"]
     if wrappers_only:
-        for name in set(innermost) - {KIND, CLASS}:
+        for name in set(innermost) - {KIND, CLASS, NUMBER}:
             del innermost[name]
     restore(env, state)
 

@@ -1,16 +1,15 @@
 """
 Capturing the state of environments as plain data, and restoring it into environments that were built alike. Restoring creates
-no objects but arrays and containers, and executes no code of the file; it sets attributes and the states of random generators.
+arrays and containers, but no other objects, and executes no code of the file. What cannot be captured is named.
 """
 
-import copyreg
 import enum
 import io
 import logging
 import random
 import types
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, OrderedDict, defaultdict, deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,21 +20,24 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.plain_data import KIND, decode, encode
 
-# Values that are not captured: definitions, and handles to the outside such as files and loggers.
+# Values that are not captured: definitions, and handles to the outside such as loggers.
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
-FIXED += (spaces.Space, np.dtype, io.IOBase, logging.Logger, ResultsWriter)
+FIXED += (np.dtype, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
+PLAIN = (bool, int, float, str, bytes)
+LISTS: dict[str, Callable[[list[Any]], Any]] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
+DICTS: dict[str, Any] = {"dict": dict, "OrderedDict": OrderedDict, "Counter": Counter}
 CLASS = ":class:"  # key of the name of an object's class
 NUMBER = ":number:"  # key of the number of an object, in the order in which objects are encountered
-PLAIN = (bool, int, float, str, bytes)
 WRAPPED = ("env", "venv", "envs")  # attributes that hold the environment that a wrapper wraps
+STATELESS = type("Stateless", (), {})  # the size of its instances is that of objects that consist of their attributes
 
 
 class MissingObjectError(ValueError):
     """An environment created an object during the run, which a new one does not have. ``path``: where it was."""
 
     def __init__(self, path: str):
-        super().__init__(f"{path} must be an object, got nothing: the original environment created one during its run.")
+        super().__init__(f"{path} must be the original object, got another or none: the run created it, or moved it there.")
         self.path = path
 
 
@@ -45,8 +47,8 @@ def capture(root: Any) -> tuple[Any, list[str]]:
     :return: its state as JSON, and the paths of objects whose state is not accessible from Python, such as a physics engine;
         empty if the state is complete
     """
-    hidden: list[str] = []
-    return _capture(root, "", {}, hidden), hidden
+    search = _Capture()
+    return search.captured(root, ""), search.hidden
 
 
 def restore(root: Any, state: Any) -> None:
@@ -56,169 +58,230 @@ def restore(root: Any, state: Any) -> None:
     :raises ValueError: if the environment was built differently
     :raises MissingObjectError: if it was built in the same way, but later created an object; the state is restored in part
     """
-    _restored(root, state, type(root).__name__, {})
+    if NUMBER not in state:
+        raise ValueError("The checkpoint must be one of this version of the package, got an earlier one. Start the run again.")
+    _Restoring().restored(root, state, type(root).__name__)
 
 
-def _capture(value: Any, path: str, seen: dict[int, int], hidden: list[str]) -> Any:
-    if value is None or type(value) in PLAIN or isinstance(value, np.generic):
-        return {KIND: "plain", "value": encode(value.hex()) if isinstance(value, bytes) else encode(value)}
-    if isinstance(value, enum.Enum):
-        return {KIND: "member", "name": value.name}
-    if isinstance(value, FIXED):
+class _Capture:
+    """``hidden``: paths of what cannot be captured."""
+
+    def __init__(self) -> None:
+        self.hidden: list[str] = []
+        self._seen: dict[int, int] = {}  # id of an object -> its number
+        self._memory: dict[int, dict[str, Any]] = {}  # id of the owner of an array's memory -> state of the first such array
+
+    def captured(self, value: Any, path: str) -> Any:
+        if value is None or type(value) in PLAIN or isinstance(value, np.generic):
+            is_bytes = isinstance(value, bytes)
+            return {KIND: "bytes", "value": value.hex()} if is_bytes else {KIND: "plain", "value": encode(value)}
+        if isinstance(value, enum.Enum):
+            return {KIND: "member", "name": value.name}
+        if isinstance(value, FIXED):
+            return None
+        if id(value) in self._seen:  # an object is captured where it is first encountered
+            return {KIND: "same", NUMBER: self._seen[id(value)]}
+        number = self._seen[id(value)] = len(self._seen)
+        found = self._captured_object(value, path)
+        if found is not None:
+            found[NUMBER] = number
+        return found
+
+    def _captured_object(self, value: Any, path: str) -> Any:
+        kind = type(value)
+        if kind is np.ndarray and value.dtype != object:
+            return self._captured_array(value)
+        if isinstance(value, th.Tensor):
+            return {KIND: "tensor", "value": encode(value.detach().cpu().numpy())}
+        if kind is random.Random:
+            return {KIND: "generator", "value": encode(value.getstate())}
+        if isinstance(value, (np.random.Generator, np.random.RandomState)):
+            state: Any = value.bit_generator.state if isinstance(value, np.random.Generator) else value.get_state()
+            return {KIND: "generator", "value": encode(state)}
+        if isinstance(value, spaces.Space):  # samples are drawn with their own generators
+            drawn = [space._np_random for space in _parts(value)]
+            return {KIND: "space", "value": encode([None if rng is None else rng.bit_generator.state for rng in drawn])}
+        if hasattr(value, "cloneSystemState"):
+            return {KIND: "emulator", "value": value.cloneSystemState().serialize().hex()}
+        if isinstance(value, io.IOBase) and (value.closed or not value.readable()):
+            return None
+        return self._captured_container(value, path) or self._captured_attributes(value, path)
+
+    def _captured_array(self, value: np.ndarray) -> dict[str, Any]:
+        state = {KIND: "array", "value": encode(value), "is_shared": False}
+        owner: Any = value
+        while isinstance(owner, np.ndarray) and owner.base is not None:
+            owner = owner.base
+        first = self._memory.setdefault(id(owner), state)
+        if first is not state:  # the new environment's arrays share memory in the same way
+            first["is_shared"] = state["is_shared"] = True
+        return state
+
+    def _captured_container(self, value: Any, path: str) -> Any:
+        kind = type(value)
+        if kind in (set, frozenset) and all(map(_is_plain_key, value)):
+            return {KIND: "list", CLASS: kind.__name__, "items": [self.captured(item, path) for item in value]}
+        if kind in (list, tuple, deque) or (isinstance(value, tuple) and hasattr(value, "_fields")):
+            items = [self.captured(item, f"{path}[{i}]") for i, item in enumerate(value)]
+            maxlen = {"maxlen": value.maxlen} if kind is deque else {}
+            return {KIND: "list", CLASS: kind.__name__, "items": items, **maxlen}
+        if kind in (*DICTS.values(), defaultdict) and all(map(_is_plain_key, value)):
+            items = [self.captured(item, f"{path}[{key!r}]") for key, item in value.items()]
+            return {KIND: "dict", CLASS: kind.__name__, "keys": [encode(key) for key in value], "items": items}
         return None
-    if id(value) in seen:  # an object is captured where it is first encountered
-        return {KIND: "same", NUMBER: seen[id(value)]}
-    seen[id(value)] = len(seen)
-    found = _captured_once(value, path, seen, hidden)
-    return None if found is None else {**found, NUMBER: seen[id(value)]}
 
-
-def _captured_once(value: Any, path: str, seen: dict[int, int], hidden: list[str]) -> Any:
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return {KIND: "plain", "value": encode(value)}
-    if isinstance(value, th.Tensor):
-        return {KIND: "tensor", "value": encode(value.detach().cpu().numpy())}
-    if type(value) is random.Random:
-        return {KIND: "generator", "value": encode(value.getstate())}
-    if isinstance(value, (np.random.Generator, np.random.RandomState)):
-        state: Any = value.bit_generator.state if isinstance(value, np.random.Generator) else value.get_state()
-        return {KIND: "generator", "value": encode(state)}
-    if hasattr(value, "cloneSystemState"):
-        return {KIND: "emulator", "value": value.cloneSystemState().serialize().hex()}
-    if isinstance(value, (list, tuple, deque)):
-        return {KIND: "items", "items": [_capture(item, f"{path}[{i}]", seen, hidden) for i, item in enumerate(value)]}
-    if isinstance(value, dict) and all(map(_is_plain_key, value)):
-        items = [_capture(item, f"{path}[{key!r}]", seen, hidden) for key, item in value.items()]
-        return {KIND: "keys", "keys": [encode(key) for key in value], "items": items}
-    if not hasattr(value, "__dict__") or not _is_made_of_attributes(type(value)):
-        hidden.append(path)
-        return None
-    children = {name: child for name, child in vars(value).items() if name not in SKIPPED}
-    kind = {CLASS: type(value).__name__} if isinstance(value, VecEnv) else {}  # gymnasium's wrappers may be substituted
-    found = {name: _capture(child, f"{path}.{name}", seen, hidden) for name, child in children.items()}
-    return {KIND: "attributes", **kind, **found}
+    def _captured_attributes(self, value: Any, path: str) -> Any:
+        kind = type(value)
+        is_larger = kind.__basicsize__ > STATELESS.__basicsize__ or kind.__itemsize__ > 0
+        if not hasattr(value, "__dict__") or is_larger or any(vars(base).get("__slots__") for base in kind.__mro__):
+            self.hidden.append(path)  # it has state that is not in its attributes
+            return None
+        children = {name: child for name, child in vars(value).items() if name not in SKIPPED}
+        named = {CLASS: kind.__name__} if isinstance(value, VecEnv) else {}  # gymnasium's wrappers may be substituted
+        found = {name: self.captured(child, f"{path}.{name}") for name, child in children.items()}
+        return {KIND: "attributes", **named, **found}
 
 
 def _is_plain_key(key: Any) -> bool:
-    return key is None or type(key) in (bool, int, str) or (type(key) is tuple and all(map(_is_plain_key, key)))
+    return key is None or type(key) in (bool, int, float, str) or (type(key) is tuple and all(map(_is_plain_key, key)))
 
 
-def _is_made_of_attributes(cls: type) -> bool:
-    """Whether instances have no state outside ``__dict__``, as those of classes that derive from one written in C have."""
-    of_c = next(base for base in cls.__mro__ if not base.__flags__ & copyreg._HEAPTYPE)  # type: ignore[attr-defined]
-    return of_c is object and not any(vars(base).get("__slots__") for base in cls.__mro__)
+def _parts(space: spaces.Space) -> Iterator[spaces.Space]:
+    """A space, and the spaces that it consists of."""
+    yield space
+    inside = getattr(space, "spaces", ())
+    for part in inside.values() if isinstance(inside, dict) else inside:
+        yield from _parts(part)
 
 
-def _restored(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    """
-    The restored value for ``current``; objects and arrays are updated in place where possible.
+class _Restoring:
+    def __init__(self) -> None:
+        self._objects: dict[int, Any] = {}  # number -> restored object
+        self._updated: dict[int, Any] = {}  # id -> object that was updated in place
 
-    :param objects: number -> restored object
-    """
-    if state is None:
+    def restored(self, current: Any, state: Any, path: str) -> Any:
+        """The restored value for ``current``; objects that consist of attributes are updated in place."""
+        if state is None:
+            return current
+        if state[KIND] == "same":
+            return self._objects.get(state[NUMBER], current)
+        found = HANDLERS[state[KIND]](self, current, state, path)
+        if NUMBER in state:
+            self._objects[state[NUMBER]] = found
+        return found
+
+    def _claimed(self, current: Any, path: str) -> Any:
+        """An object to update, which must not be one that was already updated with the state of another object."""
+        if current is None or id(current) in self._updated:
+            raise MissingObjectError(path)
+        self._updated[id(current)] = current
         return current
-    if state[KIND] == "same":
-        return objects.get(state[NUMBER], current)
-    if NUMBER in state:
-        objects[state[NUMBER]] = current  # containers may contain themselves
-    found = HANDLERS[state[KIND]](current, state, path, objects)
-    if NUMBER in state:
-        objects[state[NUMBER]] = found
-    return found
 
+    def _plain(self, current: Any, state: Any, path: str) -> Any:
+        return decode(state["value"])
 
-def _restored_member(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    if not isinstance(current, enum.Enum):
-        raise MissingObjectError(path)
-    return type(current)[state["name"]]
+    def _bytes(self, current: Any, state: Any, path: str) -> bytes:
+        return bytes.fromhex(state["value"])
 
+    def _member(self, current: Any, state: Any, path: str) -> enum.Enum:
+        if not isinstance(current, enum.Enum) or state["name"] not in type(current).__members__:
+            raise MissingObjectError(path)
+        return type(current)[state["name"]]
 
-def _restored_tensor(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    found = th.from_numpy(decode(state["value"]))
-    if isinstance(current, th.Tensor) and (current.shape, current.dtype) == (found.shape, found.dtype):
+    def _array(self, current: Any, state: Any, path: str) -> np.ndarray:
+        found = decode(state["value"])
+        if not state["is_shared"]:
+            return found  # the current one may be a constant
+        if not isinstance(current, np.ndarray) or (current.shape, current.dtype) != (found.shape, found.dtype):
+            raise MissingObjectError(path)
+        if current.flags.writeable:
+            current[...] = found
+        return current
+
+    def _tensor(self, current: Any, state: Any, path: str) -> th.Tensor:
+        found = th.from_numpy(decode(state["value"]))
+        if not isinstance(current, th.nn.Parameter):
+            return found.to(current.device) if isinstance(current, th.Tensor) else found
         with th.no_grad():
             return current.copy_(found)
-    return found
 
+    def _generator(self, current: Any, state: Any, path: str) -> Any:
+        self._claimed(current, path)
+        if isinstance(current, random.Random):
+            current.setstate(decode(state["value"]))
+        elif isinstance(current, np.random.RandomState):
+            current.set_state(decode(state["value"]))
+        else:
+            current.bit_generator.state = decode(state["value"])
+        return current
 
-def _restored_plain(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    found = decode(state["value"])
-    if isinstance(current, bytes):
-        return bytes.fromhex(found)
-    if isinstance(found, np.ndarray) and isinstance(current, np.ndarray) and current.flags.writeable:
-        if (found.shape, found.dtype) == (current.shape, current.dtype):
-            current[...] = found  # other objects may share this memory
-            return current
-    return found
+    def _space(self, current: Any, state: Any, path: str) -> Any:
+        if not isinstance(current, spaces.Space):
+            raise MissingObjectError(path)
+        for space, rng in zip(_parts(current), decode(state["value"]), strict=False):
+            if rng is not None:
+                space.np_random.bit_generator.state = rng
+        return current
 
+    def _emulator(self, current: Any, state: Any, path: str) -> Any:
+        kind = type(self._claimed(current, path).cloneSystemState())
+        current.restoreSystemState(kind(bytes.fromhex(state["value"])))
+        return current
 
-def _restored_generator(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    if current is None:
-        raise MissingObjectError(path)
-    if isinstance(current, random.Random):
-        current.setstate(decode(state["value"]))
-    elif isinstance(current, np.random.RandomState):
-        current.set_state(decode(state["value"]))
-    else:
-        current.bit_generator.state = decode(state["value"])
-    return current
+    def _attributes(self, current: Any, state: Any, path: str) -> Any:
+        found, expected = type(current).__name__, state.get(CLASS)
+        is_wrapper = expected is not None or path.rpartition(".")[2].partition("[")[0] in WRAPPED
+        if is_wrapper and (current is None or (expected is not None and found != expected)):
+            raise ValueError(
+                f"{path} must be {'an object' if expected is None else f'a {expected}'}, "
+                f"got {'nothing' if current is None else found}: the environment is not built as in the original run. "
+                "Pass one with the same wrappers, including VecNormalize."
+            )
+        self._objects[state[NUMBER]] = self._claimed(current, path)  # its attributes may refer to it
+        for name, child in state.items():
+            if name not in (KIND, CLASS, NUMBER):
+                old = getattr(current, name, None)
+                vars(current)[name] = self.restored(old, child, f"{path}.{name}")  # some objects refuse setattr
+        return current
 
+    def _list(self, current: Any, state: Any, path: str) -> Any:
+        name, items = state[CLASS], state["items"]
+        old = list(current) if isinstance(current, (list, tuple, deque)) else []
+        old += [None] * (len(items) - len(old))
+        is_list = name == "list"
+        found: list[Any] = []
+        if is_list:
+            self._objects[state[NUMBER]] = found  # it may contain itself
+        found += [self.restored(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, items, strict=False))]
+        if is_list or name in LISTS:
+            return found if is_list else LISTS[name](found)
+        if name == "deque":
+            return deque(found, state["maxlen"])
+        if type(current).__name__ != name:
+            raise MissingObjectError(path)
+        return type(current)(*found)  # a named tuple
 
-def _restored_emulator(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    kind = type(current.cloneSystemState())
-    current.restoreSystemState(kind(bytes.fromhex(state["value"])))
-    return current
-
-
-def _restored_attributes(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    found, expected = type(current).__name__, state.get(CLASS)
-    if current is None and expected is None and path.rpartition(".")[2].partition("[")[0] not in WRAPPED:
-        raise MissingObjectError(path)
-    if current is None or (expected is not None and found != expected):
-        raise ValueError(
-            f"{path} must be {'an object' if expected is None else f'a {expected}'}, "
-            f"got {'nothing' if current is None else found}: the environment is not built as in the original run. "
-            "Pass one with the same wrappers, including VecNormalize."
-        )
-    for name, child in state.items():
-        if name not in (KIND, CLASS, NUMBER):
-            old = getattr(current, name, None)
-            vars(current)[name] = _restored(old, child, f"{path}.{name}", objects)  # some objects refuse setattr
-    return current
-
-
-def _restored_keys(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    old = dict(current) if isinstance(current, dict) else {}
-    items = zip([decode(key) for key in state["keys"]], state["items"], strict=True)
-    found = {key: _restored(old.get(key), child, f"{path}[{key!r}]", objects) for key, child in items}
-    if not isinstance(current, dict):
+    def _dict(self, current: Any, state: Any, path: str) -> Any:
+        name, old = state[CLASS], current if isinstance(current, dict) else {}
+        if name == "defaultdict" and not isinstance(current, defaultdict):
+            raise MissingObjectError(path)
+        found = defaultdict(current.default_factory) if name == "defaultdict" else DICTS[name]()
+        self._objects[state[NUMBER]] = found  # it may contain itself
+        for key, child in zip(map(decode, state["keys"]), state["items"], strict=True):
+            found[key] = self.restored(dict.get(old, key), child, f"{path}[{key!r}]")
         return found
-    current.clear()
-    current.update(found)
-    return current
 
 
-def _restored_items(current: Any, state: Any, path: str, objects: dict[int, Any]) -> Any:
-    items = state["items"]
-    old = list(current) if isinstance(current, (list, tuple, deque)) else []
-    old += [None] * (len(items) - len(old))
-    found = [_restored(a, b, f"{path}[{i}]", objects) for i, (a, b) in enumerate(zip(old, items, strict=False))]
-    if isinstance(current, tuple):
-        return type(current)(*found) if hasattr(current, "_fields") else tuple(found)
-    if not isinstance(current, (list, deque)):
-        return found
-    current.clear()
-    current.extend(found)
-    return current
-
-
-HANDLERS: dict[str, Callable[[Any, Any, str, dict[int, Any]], Any]] = {
-    "plain": _restored_plain,
-    "member": _restored_member,
-    "tensor": _restored_tensor,
-    "generator": _restored_generator,
-    "emulator": _restored_emulator,
-    "items": _restored_items,
-    "keys": _restored_keys,
-    "attributes": _restored_attributes,
+HANDLERS: dict[str, Callable[[_Restoring, Any, Any, str], Any]] = {
+    "plain": _Restoring._plain,
+    "bytes": _Restoring._bytes,
+    "member": _Restoring._member,
+    "array": _Restoring._array,
+    "tensor": _Restoring._tensor,
+    "generator": _Restoring._generator,
+    "space": _Restoring._space,
+    "emulator": _Restoring._emulator,
+    "list": _Restoring._list,
+    "dict": _Restoring._dict,
+    "attributes": _Restoring._attributes,
 }

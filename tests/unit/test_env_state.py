@@ -4,11 +4,14 @@ import dataclasses
 import enum
 import json
 import random
+from collections import deque
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
@@ -78,6 +81,14 @@ class Tool(enum.IntEnum):
     NONE, KEY = 0, 1
 
 
+class Pair(NamedTuple):
+    x: int
+    y: int
+
+
+START = np.zeros(2)
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     size: int
@@ -101,6 +112,12 @@ class House:
         self.grid = np.zeros(3)
         self.shown = self.grid
         self.by_phase = {None: 0, ("a", 1): 2}
+        self.body, self.last, self.noise, self.name, self.visited = [], None, None, None, set()
+        self.pair = Pair(0, 0)
+        self.pieces = np.zeros((2, 2))
+        self.row = self.pieces[1]
+        self.space = spaces.Dict(x=spaces.Discrete(1000, seed=3))
+        self.place = START
         self.myself = self
 
     def live(self):
@@ -112,6 +129,14 @@ class House:
         self.settings.field[:] = 7
         self.grid[1] = 5
         self.by_phase[None] = 9
+        self.body.append((1, 2))
+        self.body.append(self.body)
+        self.last, self.noise, self.name = (3, b"ab"), deque([1, 2], maxlen=2), b"x"
+        self.visited.add((1, 2))
+        self.pair = Pair(4, 5)
+        self.row[:] = 6
+        self.space.sample()
+        self.place = self.place + 1
 
 
 def moved(house):
@@ -134,17 +159,43 @@ def test_values_of_many_kinds_are_restored():
     assert other.settings.size == 4 and other.settings.field.tolist() == [7, 7]
     assert other.shown is other.grid and other.grid.tolist() == [0, 5, 0]
     assert other.by_phase == {None: 9, ("a", 1): 2} and other.myself is other
+    assert other.body[0] == (1, 2) and type(other.body[0]) is tuple and other.body[1] is other.body
+    assert (other.last, other.noise, other.name) == ((3, b"ab"), deque([1, 2]), b"x") and other.noise.maxlen == 2
+    assert other.visited == {(1, 2)} and other.pair == Pair(4, 5) and type(other.pair) is Pair
+    other.row[:] = 8
+    assert other.pieces.tolist() == [[0, 0], [8, 8]]  # still a view
+    assert other.space.sample() == house.space.sample()
+    assert other.place.tolist() == [1, 1] and START.tolist() == [0, 0]
 
 
 def test_objects_that_only_the_original_run_created_are_named():
     house = House()
     house.rooms.append(Room("attic"))
-    with pytest.raises(MissingObjectError, match=r"House.rooms\[2\] must be an object, got nothing"):
+    with pytest.raises(MissingObjectError, match=r"House.rooms\[2\] must be the original object"):
         moved(house)
 
 
-def test_objects_with_state_in_c_are_named():
+def test_objects_that_the_run_moved_to_the_place_of_others_are_named():
+    class Flat:
+        def __init__(self):
+            self.room = None
+            self.rooms = [Room("hall"), Room("kitchen")]
+            self.room = self.rooms[0]
+
+    flat, fresh = Flat(), Flat()
+    state = capture(flat)[0]
+    restore(fresh, state)
+    assert fresh.room is fresh.rooms[0]
+    flat.room = flat.rooms[1]
+    with pytest.raises(MissingObjectError, match=r"Flat.rooms\[0\]"):
+        restore(Flat(), capture(flat)[0])
+
+
+def test_objects_with_state_in_c_are_named(tmp_path):
     class Queue(bytearray):
+        pass
+
+    class Generator(random.Random):
         pass
 
     class Slotted:
@@ -152,7 +203,11 @@ def test_objects_with_state_in_c_are_named():
 
     house = House()
     house.queue, house.slotted, house.plain = Queue(b"ab"), Slotted(), Room("x")
-    assert capture(house)[1] == [".queue", ".slotted"]
+    house.generator, house.masked = Generator(3), np.ma.masked_array([1, 2], [True, False])
+    (tmp_path / "steps.txt").write_text("1 2 3")
+    with open(tmp_path / "steps.txt") as house.file:
+        assert capture(house)[1] == [".queue", ".slotted", ".generator", ".masked", ".file"]
+    assert ".file" not in capture(house)[1]  # a closed file has no state
 
 
 def test_state_that_cannot_be_captured_is_named():
