@@ -65,9 +65,20 @@ def write_checkpoint(
 
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
-    """The arguments of an agent that are plain values, used to distinguish its run from others."""
-    found = {name: getattr(model, name, None) for name in ALGORITHM if name not in ("verbose", "tensorboard_log")}
-    return {name: value for name, value in found.items() if isinstance(value, (bool, int, float, str))}
+    """The arguments of an agent and its spaces as plain data, used to distinguish its run from others."""
+    names = [name for name in ALGORITHM if name not in ("verbose", "tensorboard_log", "device")]
+    found = {name: _without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
+    spaces = {"observation_space": repr(model.observation_space), "action_space": repr(model.action_space)}
+    return {**found, "resets": encode(getattr(model, "resets", None)), **spaces}
+
+
+def _without_pickles(value: Any) -> Any:
+    """Encoded data with the types of pickled objects in place of their pickles, which differ from process to process."""
+    if isinstance(value, list):
+        return [_without_pickles(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    return value["type"] if value.get(KIND) == "pickle" else {key: _without_pickles(item) for key, item in value.items()}
 
 
 @contextmanager
@@ -210,7 +221,8 @@ class ExactCheckpointCallback(BaseCallback):
         other = [name for name in theirs if theirs[name] != ours.get(name)]
         is_behind = self.model.seed is None and manifest.get("num_timesteps", 0) > self.model.num_timesteps
         if other or is_behind:
-            why = f"{other[0]} = {theirs[other[0]]!r} there, {ours.get(other[0])!r} here" if other else "this run has no seed"
+            why = f"{other[0]} = {decode(theirs[other[0]])!r} there, {decode(ours.get(other[0]))!r} here" if other else ""
+            why = why or "this run has no seed"
             raise ValueError(
                 f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
                 "Pass another folder, or resume that run."

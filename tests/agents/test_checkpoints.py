@@ -139,10 +139,19 @@ def test_callback_arguments(wrong, tmp_path):
 def test_different_runs_cannot_share_a_folder(checkpoint):
     folder = checkpoint.parent
     before = sorted(folder.iterdir())
-    for changes, why in (({"gamma": 0.5}, "gamma = 0.99 there, 0.5 here"), ({"seed": None}, r"seed = 3 there, None here")):
+    group = {**SMALL["policy_kwargs"], "group": "SO(3)"}
+    for changes, why in (
+        ({"gamma": 0.5}, "gamma = 0.99 there, 0.5 here"),
+        ({"seed": None}, r"seed = 3 there, None here"),
+        ({"policy_kwargs": group}, r"policy_kwargs = \{.*'latent_hidden_dim': 8,.*'group': 'SO\(3\)'"),
+        ({"resets": {"interval": 5}}, r"resets = "),
+        ({"learning_rate": lambda progress: 1e-3}, r"learning_rate = 0.0001 there, .*function"),
+    ):
         other = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, **changes})
         with pytest.raises(ValueError, match=rf"must be empty or hold checkpoints of this run, .*{why}.*Pass another folder"):
             other.learn(60, ExactCheckpointCallback(20, folder))
+    with pytest.raises(ValueError, match=r"observation_space = 'Box.*\(3,\), float32\)' there"):
+        EqRQRDQN("MlpPolicy", "Acrobot-v1", **SMALL).learn(60, ExactCheckpointCallback(20, folder))
     assert sorted(folder.iterdir()) == before
     EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(30, ExactCheckpointCallback(20, folder))  # the same run once more
 
