@@ -99,12 +99,15 @@ def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: in
     """
     # Monitor is outside the wrappers, so that it sees the protocol's episodes.
     env = make_vec_env(make_game, n_envs=protocol["evaluation"]["n_envs"], seed=seed, env_kwargs={"protocol": protocol})
+    settings = preprocessing_of(protocol)
+    wrap: Any = get_wrapper_class(settings, "vec_env_wrapper")
+    env = env if wrap is None else wrap(env)
     old = model.get_vec_normalize_env()
-    if old is not None:
-        ranges: dict[str, Any] = {"clip_obs": old.clip_obs, "epsilon": old.epsilon}
-        env = VecNormalize(env, training=False, norm_obs=old.norm_obs, norm_reward=False, **ranges)
+    if old is not None and old.norm_obs:
+        ranges: dict[str, Any] = {"clip_obs": old.clip_obs, "epsilon": old.epsilon, "norm_obs_keys": old.norm_obs_keys}
+        env = VecNormalize(env, training=False, norm_reward=False, **ranges)
         env.obs_rms = copy.deepcopy(old.obs_rms)
-    n_stack = preprocessing_of(protocol).get("frame_stack")
+    n_stack = settings.get("frame_stack")
     return VecFrameStack(env, n_stack) if n_stack else env
 
 

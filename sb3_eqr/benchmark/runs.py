@@ -159,7 +159,7 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
         for agent in found:
             entry = hyperparameters(agent, protocol, action_space)
             for seed in range(n_seeds):
-                place = folder / "runs" / agent.name.replace(":", "-") / game / str(seed)
+                place = folder / "runs" / agent.name.replace(":", "-") / game.replace("/", "-") / str(seed)
                 unnamed = defaults(agent, entry)
                 runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command, unnamed))
     for run in runs:
@@ -180,6 +180,8 @@ def with_present_defaults(runs: list[Run]) -> list[Run]:
     ]
     for run in found:
         _check_plan(run)
+        if not run.has_begun():
+            write_json(run.folder / PLAN, run.description())
     return found
 
 

@@ -71,7 +71,7 @@ def never_learn(results: list[dict[str, Any]]) -> list[str]:
     found: dict[str, dict[str, None]] = {}
     for result in results:
         starts, steps = result["entry"]["hyperparameters"].get("learning_starts", 0), result["protocol"]["steps"]
-        if starts >= steps:
+        if starts is not None and starts >= steps:  # None: a tenth of the steps or less
             found.setdefault(result["agent"], {})[f"{result['game']} (learning_starts {starts:,} of {steps:,} steps)"] = None
     return [f"{agent} makes no update on {', '.join(where)}: it stays untrained." for agent, where in found.items()]
 

@@ -96,6 +96,9 @@ class Suite(Strict):
     def _covers_games(self) -> "Suite":
         if "{game}" not in self.env_id and len(self.games) > 1:
             raise ValueError(f"env_id must contain {{game}}, got {self.env_id!r}.")
+        folders = [game.replace("/", "-") for game in self.games]
+        if unfit := [game for game, name in zip(self.games, folders, strict=True) if folders.count(name) > 1 or "\\" in name]:
+            raise ValueError(f"games must have names that differ as names of folders, got {', '.join(unfit)}.")
         for what, there in (("steps", self.steps), ("normalisation: scores", self.normalisation.scores)):
             if missing := [game for game in self.games if game not in there]:
                 raise ValueError(f"{what} must have every game, got none for {', '.join(missing)}.")

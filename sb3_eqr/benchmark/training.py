@@ -257,7 +257,9 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
 
 def remove_checkpoints(folder: pathlib.Path) -> None:
     """Remove the checkpoints of a finished run, and partial files that a killed run left."""
-    for path in [*find_checkpoints(folder), *folder.glob(f".{PREFIX}*"), folder / f".{MODELS}"]:
+    for checkpoint in find_checkpoints(folder):
+        checkpoints.discard(checkpoint)
+    for path in [*folder.glob(f".{PREFIX}*"), folder / f".{MODELS}"]:
         shutil.rmtree(path, ignore_errors=True)
 
 

@@ -7,7 +7,7 @@ import pathlib
 import shutil
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -60,8 +60,15 @@ def write_checkpoint(
         }
         (partial / MANIFEST).write_text(json.dumps({**manifest, "digest": digest(manifest)}), encoding="utf-8")
     for old in find_checkpoints(folder)[:-keep]:
-        shutil.rmtree(old, ignore_errors=True)
+        discard(old)
     return checkpoint
+
+
+def discard(checkpoint: pathlib.Path) -> None:
+    """Remove a checkpoint. If the process is killed meanwhile, the next call of ``write_checkpoint`` removes the rest."""
+    leftover = checkpoint.with_name(f".{checkpoint.name}.old.partial")
+    with suppress(OSError):
+        shutil.rmtree(checkpoint.rename(leftover), ignore_errors=True)
 
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:

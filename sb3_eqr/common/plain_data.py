@@ -227,17 +227,25 @@ def _is_legal(value: Any) -> bool:
 
 
 def names_in(content: bytes) -> list[str]:
-    """The names that a pickle would import, and so may run, determined without loading it."""
+    """The names that a pickle would import, and so may run, found without loading it; "(unreadable)" stands for others."""
     names: list[str] = []
-    strings: list[str] = []
+    top: list[Any] = []  # the strings on top of the stack, as far as they are known
+    memo: dict[int, Any] = {}
     try:
         for code, argument, _ in pickletools.genops(content):
             if code.name in ("GLOBAL", "INST"):
                 names.append(str(argument).replace(" ", "."))
-            elif code.name == "STACK_GLOBAL" and len(strings) >= 2:
-                names.append(".".join(strings[-2:]))
-            if isinstance(argument, str):
-                strings.append(argument)
+            elif code.name == "STACK_GLOBAL":
+                known = len(top) >= 2 and all(isinstance(part, str) for part in top[-2:])
+                names.append(".".join(top[-2:]) if known else "(unreadable)")
+            if code.name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
+                memo[len(memo) if argument is None else int(argument)] = top[-1] if top else None
+            elif code.name in ("GET", "BINGET", "LONG_BINGET"):
+                top.append(memo.get(int(str(argument))))
+            elif "UNICODE" in code.name or "STRING" in code.name:
+                top.append(argument)
+            elif code.name not in ("PROTO", "FRAME"):
+                top = []
     except (ValueError, pickle.UnpicklingError):
         names.append("(unreadable)")
     return sorted(set(names))

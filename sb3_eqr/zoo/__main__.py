@@ -117,6 +117,8 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     if path is None:
         check_entry(args.hyperparams, algo, "--hyperparams")
         return None
+    if args.resume is not None and args.conf_file is None:
+        path = settings_of_run(args) or path
     entry = read_entry(path, args.env, args.hyperparams)
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
@@ -127,6 +129,21 @@ def prepare_training(args: argparse.Namespace) -> str | None:
         print(f"Using the entry {name!r} of {path}")
         return str(file)
     return path
+
+
+def settings_of_run(args: argparse.Namespace) -> str | None:
+    """:return: a file with the entry of the run to resume, from the files in its folder; ``None`` if they are not there"""
+    from sb3_eqr.zoo.resuming import config_of
+
+    try:
+        entry = config_of(args.resume, args.trust)
+    except ValueError as error:
+        fail(f"--resume: {error}")
+    if entry is None:
+        return None
+    file = pathlib.Path(tempfile.mkdtemp()) / f"{args.algo}.yml"
+    file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
+    return str(file)
 
 
 def without_resuming(arguments: list[str]) -> list[str]:
@@ -182,8 +199,13 @@ def check_trained(args: argparse.Namespace) -> None:
         )
     except (AssertionError, ValueError) as error:
         runs = pathlib.Path(args.folder, args.algo or "ppo").glob(f"{EnvironmentName(args.env)}_*/*.zip")
-        ids = sorted({int(run.parent.name.rpartition("_")[2]) for run in runs})
+        places = {run.parent.name.rpartition("_")[2]: run for run in runs}
+        ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
         found = f" There are models in {' and '.join(map(str, ids))}: pass --exp-id." if ids else ""
+        if places and not ids:
+            found = (
+                f" Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
+            )
         fail(f"{error}.{found} Pass -f with the folder given to train (logs by default), or train one first.")
 
 

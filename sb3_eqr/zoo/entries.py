@@ -45,6 +45,8 @@ RULES = {
     "n_timesteps": number(0, above=True),
     "n_envs": integer(1),
     "frame_stack": integer(1) | NONE,
+    "learning_starts": number(0) | NONE,
+    "buffer_size": number(1),
     "normalize": FLAG | TEXT | DICTIONARY,
     "learning_rate": number(0) | Rule("lin_ and a number (YAML reads 1e-3 as text: write 1.0e-3)", is_schedule),
 }

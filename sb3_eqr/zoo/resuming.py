@@ -9,12 +9,23 @@ from rl_zoo3 import train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.checkpoints import ExactCheckpointCallback
+from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.zoo.checks import fail
+from sb3_eqr.zoo.trust import check_zoo_folder, read_plain
 
 FOLDER = "checkpoints"  # in the folder of a run
+
+
+class RngPreserving(EventCallback):
+    """A callback that does not change the random generators."""
+
+    def _on_step(self) -> bool:
+        with preserved_rng_state(self.model.action_space):
+            return self._on_event()
 
 
 class ResumableExperiment(ExperimentManager):
@@ -38,6 +49,9 @@ class ResumableExperiment(ExperimentManager):
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""
         super().create_callbacks()
+        if self.checkpoint_every is not None or self.resume is not None:
+            # RL Zoo evaluates Atari's agents with random actions, and a resumed run evaluates them at other steps.
+            self.callbacks = [RngPreserving(c) if isinstance(c, EvalCallback) else c for c in self.callbacks]
         if self.checkpoint_every is not None:
             folder = pathlib.Path(self.save_path) / FOLDER
             self.callbacks.append(ExactCheckpointCallback(self.checkpoint_every, folder, verbose=self.verbose))
@@ -64,6 +78,22 @@ class ResumableExperiment(ExperimentManager):
 def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
     """The folder of checkpoints in a run's folder; any other path is returned unchanged."""
     return path / FOLDER if (path / FOLDER).is_dir() else path
+
+
+def config_of(path: pathlib.Path, trust: bool) -> dict[str, Any] | None:
+    """
+    :param path: as ``resume`` in :func:`install`, or one checkpoint
+    :param trust: whether the settings may name code of other packages
+    :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
+    :raises ValueError: if they name code of other packages
+    """
+    for run in (path, path.parent, path.parent.parent):
+        for config in sorted(run.glob("*/config.yml")):
+            if not trust:
+                check_zoo_folder(config.parent)
+            entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
+            return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
+    return None
 
 
 def install(checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool) -> None:

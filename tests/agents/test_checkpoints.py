@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 import sb3_eqr
 from sb3_eqr import EqRQRDQN, EqRRainbow, envs
-from sb3_eqr.common.checkpoints import ExactCheckpointCallback, write_checkpoint
+from sb3_eqr.common.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.toys import ChainEnv
 
@@ -128,6 +128,16 @@ def test_an_environment_that_creates_objects_is_resumed_with_new_episodes(tmp_pa
         model = EqRQRDQN.resume(tmp_path, GrowingEnv())
     assert model._last_obs is None
     model.learn(20, reset_num_timesteps=False)
+
+
+def test_a_checkpoint_that_was_removed_in_part_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)  # as if the process was killed here
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, tmp_path, keep=1))
+    left = list(tmp_path.glob(".checkpoint-*"))
+    assert left and len(find_checkpoints(tmp_path)) == 1
+    monkeypatch.undo()
+    write_checkpoint(tmp_path, model)
+    assert not list(tmp_path.glob(".*")) and len(find_checkpoints(tmp_path)) == 1
 
 
 @pytest.mark.parametrize("wrong", [{"save_freq": 0}, {"save_freq": 1.5}, {"keep": 0}])

@@ -236,6 +236,8 @@ def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, monk
     (run.folder / "result.json").unlink()
     (waiting,) = with_present_defaults([run])
     assert waiting.defaults["policy_kwargs"]["n_atoms"] == 11
+    assert read_plan(files / "b")[0].defaults == waiting.defaults  # which the next call compares with
+    write_plan(files / "b", suite, [run])
     with (
         FileLock(run.folder / "lock"),
         pytest.raises(ValueError, match=r"policy_kwargs.n_atoms must be 51, as when the run was"),
@@ -284,6 +286,7 @@ def test_the_command_without_its_extra(monkeypatch):
             "evaluation: epsilon: input should be less than or equal to 1, got 7",
         ),
         ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "got none for CartPole, Acrobot"),
+        ({"games": ["a/b", "a-b"], "steps": 4}, "games must have names that differ as names of folders, got a/b, a-b"),
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
 )

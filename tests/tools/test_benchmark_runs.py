@@ -10,7 +10,8 @@ from filelock import FileLock
 from rl_zoo3.utils import create_test_env, get_saved_hyperparams
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from benchmarks import packed_runs
 from sb3_eqr.benchmark import training
@@ -293,6 +294,33 @@ def test_an_endless_atari_game_is_counted_at_the_step_limit(monkeypatch):
     monkeypatch.setattr(atari, "MAX_STEPS", 30)
     _, lengths = evaluate(Fixed(), atari_protocol("Boxing", n_envs=1), 2, seed=0)
     assert lengths == [30, 30]
+
+
+@pytest.mark.parametrize("normalize", [{"norm_obs": False}, {"norm_obs_keys": ["vec"]}, {}], ids=str)
+def test_evaluation_normalises_what_training_did(normalize):
+    class Trained(Fixed):
+        def get_vec_normalize_env(self):
+            return trained
+
+    same = lambda: np.random.seed(0) or SimpleMultiObsEnv(channel_last=False, random_start=False)  # noqa: E731
+    gym.register("Multi-v0", same)  # its constructor draws the observations
+    protocol = {"env_id": "Multi-v0", "preprocessing": {}, "evaluation": {"n_envs": 1, "max_steps": None, "preprocessing": {}}}
+    trained = VecNormalize(make_vec_env("Multi-v0", seed=3), **{"norm_obs_keys": ["vec"], **normalize})
+    trained.reset()
+    trained.step(np.array([1]))
+    env = make_evaluation_env(protocol, Trained(), seed=4)
+    plain = make_vec_env("Multi-v0", seed=4)
+    assert np.array_equal(env.reset()["vec"], trained.normalize_obs(plain.reset())["vec"])
+    del gym.registry["Multi-v0"]
+
+
+def test_evaluation_has_the_wrapper_of_the_vectorised_environment():
+    wrapper = "stable_baselines3.common.vec_env.VecExtractDictObs"
+    gym.register("Multi-v0", lambda: SimpleMultiObsEnv(channel_last=False))
+    protocol = {"env_id": "Multi-v0", "preprocessing": {"vec_env_wrapper": [{wrapper: {"key": "vec"}}]}}
+    protocol["evaluation"] = {"n_envs": 1, "max_steps": None, "preprocessing": {}}
+    assert make_evaluation_env(protocol, Fixed(), seed=4).observation_space.shape == (5,)
+    del gym.registry["Multi-v0"]
 
 
 class Watching(Fixed):

@@ -301,6 +301,12 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
         ("args.yml", "env: Ring-v0\ngym_packages: [antigravity]", "got antigravity"),
         ("args.yml", "env: antigravity:Ring-v0", "got antigravity:Ring-v0"),
         ("config.yml", "env_wrapper: [{subprocess.run: {}}]", r"got subprocess\.run"),
+        (
+            "config.yml",
+            "env_wrapper: [{stable_baselines3.common.monitor.Monitor: {filename: x}}]",
+            "write no files, got .*Monitor",
+        ),
+        ("config.yml", "env_wrapper: gymnasium.wrappers.RecordVideo", "write no files, got .*RecordVideo"),
         ("config.yml", "normalize: dict(norm_obs=print())", "got dict"),
         ("vecnormalize.pkl", pickle.dumps(functools.partial(print)), r"it names functools\.partial"),
     ],

@@ -15,13 +15,16 @@ import torch as th
 import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
-from tests.toys import ImageEnv
+from sb3_eqr.zoo.resuming import RngPreserving
+from sb3_eqr.zoo.trust import read_plain
+from tests.toys import ChainEnv, ImageEnv
 
 
 @pytest.fixture
@@ -234,6 +237,34 @@ def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
     assert first.num_timesteps == second.num_timesteps == 1408  # a round of 128 steps
     for name, parameter in first.policy.state_dict().items():
         assert th.equal(parameter, second.policy.state_dict()[name]), name
+
+
+def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
+    line = f"train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
+    sb3_eqr(f"{line} -n 300 --checkpoint-every 100 -params n_envs:2 gradient_steps:1 gamma:0.9 learning_starts:20")
+    sb3_eqr(f"{line} -n 400 --resume {tmp_path}/eqr_qrdqn/CartPole-v1_1")
+    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_2"
+    model = EqRQRDQN.load(resumed / "CartPole-v1.zip")
+    assert (model.n_envs, model.gradient_steps, model.gamma) == (2, 1, 0.9) and model.num_timesteps >= 400
+    settings = read_plain(resumed / "CartPole-v1" / "config.yml")
+    assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
+
+
+class Drawing(BaseCallback):
+    """Uses all random generators, as an evaluation with random actions does."""
+
+    def _on_step(self):
+        return np.random.rand() + th.rand(1).item() + self.model.action_space.sample() < 10
+
+
+def test_evaluations_of_a_run_with_checkpoints_do_not_change_it():
+    def train(callback):
+        model = EqRQRDQN("MlpPolicy", ChainEnv(), learning_starts=20, buffer_size=200, batch_size=8, seed=0)
+        return model.learn(60, callback).policy.state_dict()
+
+    alone, watched, changed = train(None), train(RngPreserving(Drawing())), train(Drawing())
+    assert all(th.equal(value, watched[name]) for name, value in alone.items())
+    assert not all(th.equal(value, changed[name]) for name, value in alone.items())
 
 
 def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import pickletools
 import sys
 from collections import deque
 from functools import partial
@@ -94,6 +95,18 @@ FORGED = [
 def test_forged_data_raises(forged):
     with pytest.raises(ValueError):
         decode(forged)
+
+
+def test_a_pickle_cannot_hide_what_it_would_run():
+    """The names are memorised and removed; then others are put on the stack; then the first are recalled."""
+    push = [b"\x8c" + bytes([len(text)]) + text for text in (b"posix", b"system", b"collections", b"OrderedDict", b"true")]
+    hidden = push[0] + b"\x940" + push[1] + b"\x940"  # MEMOIZE, POP
+    content = b"\x80\x04" + hidden + push[2] + b"0" + push[3] + b"0h\x00h\x01\x93" + push[4] + b"\x85R."
+    codes = [code.name for code, *_ in pickletools.genops(content)]
+    assert codes[-7:] == "BINGET BINGET STACK_GLOBAL SHORT_BINUNICODE TUPLE1 REDUCE STOP".split()
+    assert names_in(content) == ["posix.system"]
+    unknown = b"\x80\x04" + push[0] + push[1] + b"2\x93."  # DUP
+    assert names_in(unknown) == ["(unreadable)"]
 
 
 def test_a_file_cannot_choose_the_imported_module():

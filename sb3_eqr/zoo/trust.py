@@ -9,8 +9,10 @@ from typing import Any
 import yaml
 
 PASS_TRUST = "If you know where the file comes from, pass --trust."
-# A file may name classes and functions of these modules.
-WRAPPERS = ("sb3_eqr.", "stable_baselines3.", "sb3_contrib.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
+# A file may name the wrappers of these modules, except those that write files.
+WRAPPERS: tuple[str, ...] = ("sb3_eqr.envs.", "stable_baselines3.common.atari_wrappers.", "stable_baselines3.common.vec_env.")
+WRAPPERS += ("sb3_contrib.common.wrappers.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
+WRITING = ("Monitor", "Record", "Video")  # parts of names
 # The only names in the statistics of VecNormalize. NumPy has moved its private modules from core to _core.
 STATISTICS = {
     "stable_baselines3.common.vec_env.vec_normalize": ("VecNormalize",),
@@ -75,7 +77,7 @@ def check_zoo_folder(folder: pathlib.Path) -> None:
     arguments, config = read_plain(folder / "args.yml"), read_plain(folder / "config.yml")
     named = [*(arguments.get("gym_packages") or []), *([arguments["env"]] if ":" in str(arguments.get("env")) else [])]
     for key in ("env_wrapper", "vec_env_wrapper"):
-        named += [name for name in _names(config.get(key)) if not name.startswith(WRAPPERS)]
+        named += [name for name in _names(config.get(key)) if not _is_harmless(name)]
     normalize = config.get("normalize")
     if isinstance(normalize, str):
         try:
@@ -83,7 +85,8 @@ def check_zoo_folder(folder: pathlib.Path) -> None:
         except (ValueError, SyntaxError):
             named.append(normalize)
     if named:
-        raise ValueError(f"{folder} must name only code of {WRAPPERS}, got {', '.join(map(str, named))}. {PASS_TRUST}")
+        found = ", ".join(map(str, named))
+        raise ValueError(f"{folder} must name only wrappers of {WRAPPERS} that write no files, got {found}. {PASS_TRUST}")
     check_statistics(folder / "vecnormalize.pkl")
 
 
@@ -99,6 +102,10 @@ def check_statistics(path: pathlib.Path) -> None:
             _Statistics(file).load()
     except Exception as error:  # a damaged pickle may raise anything
         raise ValueError(f"{path} must contain only statistics of VecNormalize, got: {error}. {PASS_TRUST}") from error
+
+
+def _is_harmless(name: str) -> bool:
+    return name.startswith(WRAPPERS) and not any(part in name.rpartition(".")[2] for part in WRITING)
 
 
 def _names(wrappers: Any) -> list[str]:
