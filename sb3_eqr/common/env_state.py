@@ -4,6 +4,7 @@ arrays and containers, but no other objects, and executes no code of the file. W
 """
 
 import enum
+import functools
 import io
 import logging
 import random
@@ -22,7 +23,7 @@ from sb3_eqr.common.plain_data import KIND, decode, encode
 
 # Values that are not captured: definitions, and handles to the outside such as loggers.
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
-FIXED += (np.dtype, logging.Logger, ResultsWriter)
+FIXED += (functools.partial, np.ufunc, np.dtype, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
 PLAIN = (bool, int, float, str, bytes)
 LISTS: dict[str, Callable[[list[Any]], Any]] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
