@@ -26,7 +26,7 @@ FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.Bui
 FIXED += (functools.partial, np.ufunc, np.dtype, logging.Logger, ResultsWriter)
 SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
 PLAIN = (bool, int, float, str, bytes)
-LISTS: dict[str, Callable[[list[Any]], Any]] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
+UNCHANGING: dict[str, Any] = {"tuple": tuple, "frozenset": frozenset, "set": set}  # or not able to contain themselves
 DICTS: dict[str, Any] = {"dict": dict, "OrderedDict": OrderedDict, "Counter": Counter}
 CLASS = ":class:"  # key of the name of an object's class
 NUMBER = ":number:"  # key of the number of an object, in the order in which objects are encountered
@@ -249,13 +249,14 @@ class _Restoring:
         name, items = state[CLASS], state["items"]
         old = list(current) if isinstance(current, (list, tuple, deque)) else []
         old += [None] * (len(items) - len(old))
-        is_list = name == "list"
         found: list[Any] = []
-        if is_list:
+        if name == "list":
             self._objects[state[NUMBER]] = found  # it may contain itself
         found += [self.restored(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, items, strict=False))]
-        if is_list or name in LISTS:
-            return found if is_list else LISTS[name](found)
+        if name == "list":
+            return found
+        if name in UNCHANGING:
+            return UNCHANGING[name](found)
         if name == "deque":
             return deque(found, state["maxlen"])
         if type(current).__name__ != name:
