@@ -15,7 +15,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
-# CartPole, which is learned in two minutes, then a game; `make demo GAME=Boxing` is the game alone.
+# CartPole, about two minutes, then a game; `make demo GAME=Boxing` is the game alone.
 demo: $(VENV)/installed
 	$(if $(GAME),,$(DEMO) --game CartPole-v1)
 	$(DEMO) --game "$(or $(GAME),Pong)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))

@@ -1,7 +1,7 @@
 """
 An EqR agent on one environment, from training to a plot and a video of what it observes and predicts.
 
-    python examples/demo.py --game CartPole-v1                # EqRQRDQN, 15,000 steps, enough to learn it
+    python examples/demo.py --game CartPole-v1                # EqRQRDQN, 15,000 steps
     python examples/demo.py --game Pong                       # as many steps as fit into --minutes
     python examples/demo.py --game Boxing --steps 100000      # the full benchmark
     python examples/demo.py --config eqr_rainbow --steps 3000
@@ -171,7 +171,8 @@ def show(model: EqRAlgorithm, args: argparse.Namespace, scores: list[tuple[int, 
             return_episode_rewards=True,
         )
     assert isinstance(found, list)
-    print(f"score of {len(found)} episodes after {model.num_timesteps} steps: mean {np.mean(found):.1f}, each {found}")
+    each = f"mean {np.mean(found):.1f}, lowest {min(found):g}, highest {max(found):g}"
+    print(f"score of {len(found)} episodes after {model.num_timesteps} steps: {each}")
     title = f"{args.config} on {args.game}, {model.num_timesteps} steps, {model._n_updates} updates"
     progress = pd.read_csv(out / "progress.csv")
     draw(progress, scores, float(np.mean(found)), model.learning_starts, title, out / "training.png")
@@ -195,7 +196,9 @@ def main() -> None:
     )
     parser.add_argument("--steps", type=int, help="100000 is the benchmark; if not given, as many as fit into --minutes")
     parser.add_argument("--minutes", type=float, default=5.5, help="total time, if --steps is not given")
-    parser.add_argument("--eval-episodes", type=int, default=3, help="episodes of the final evaluation")
+    parser.add_argument(
+        "--eval-episodes", type=int, help="episodes of the final evaluation; if not given, 3 on Atari, else 20"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of all random generators")
     parser.add_argument(
         "--out",
@@ -210,6 +213,7 @@ def main() -> None:
     out = args.out or pathlib.Path("demo_results") / (game if args.config == "eqr_qrdqn" else f"{game}-{args.config}")
     settings: dict = {}
     seconds, start = None, time.monotonic()
+    args.eval_episodes = args.eval_episodes or (3 if is_atari(game) else 20)
     if not is_atari(game):
         args.steps = args.steps or CLASSIC_STEPS
     elif args.steps is None:
@@ -217,7 +221,8 @@ def main() -> None:
         args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}
     elif "exploration_fraction" in (config := load_configuration(args.config)):
-        settings = {"exploration_fraction": config["exploration_fraction"] * FULL_STEPS / args.steps}  # the same steps
+        share = config["exploration_fraction"] * FULL_STEPS / args.steps  # the same number of steps
+        settings = {"exploration_fraction": min(share, 1.0)}
     print(f"{args.config} on {args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
 
     model = make_model(args.config, args.width_scale, args.game, args.seed, **settings)

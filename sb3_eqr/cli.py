@@ -16,8 +16,6 @@ def main() -> None:
         run = importlib.import_module(f"sb3_eqr.{extra}.__main__").main
     except ImportError as error:
         advice = "" if "pip install" in str(error) else f'. Run pip install ".[{extra}]" in a clone of the repository'
-        others = (
-            "" if extra in COMMANDS else ". Available without it: " + ", ".join(f"sb3-eqr {name} --help" for name in COMMANDS)
-        )
+        others = "" if extra in COMMANDS else ". " + " ".join(f'sb3-eqr {name} needs ".[{name}]".' for name in COMMANDS)
         sys.exit(f"sb3-eqr: {error}{advice}{others}")
     run()

@@ -44,6 +44,8 @@ class FiniteData(OffPolicyAlgorithm):
 
     def _warn_without_normalization(self) -> None:
         """Warn if an agent trained with VecNormalize would now get raw observations, with which its actions are useless."""
+        if self.env is None:
+            return  # SB3 raises an error
         counts = (
             [part.count for part in _parts(self._vec_normalize_env, "obs_rms").values()] if self._vec_normalize_env else []
         )

@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_eqr.common.arguments import POLICY, check_arguments
+from sb3_eqr.common.arguments import ALGORITHM, POLICY, check_arguments
 from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import Group, NoGroup
 from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection, frozen_copy
@@ -152,6 +152,9 @@ class EqRPolicy(BasePolicy):
     ):
         given = {**locals(), **stock_kwargs}
         stock = inspect.signature(super().__init__).parameters
+        if misplaced := sorted(stock_kwargs.keys() & ALGORITHM.keys()):
+            name = misplaced[0]
+            raise TypeError(f"policy_kwargs: {name!r} is an argument of the agent. Pass {name}=... beside policy_kwargs.")
         if any(name not in stock for name in stock_kwargs):
             own = [inspect.signature(kind.__init__).parameters for kind in (type(self), EqRPolicy)]  # type: ignore[misc]
             names = {name for parameters in own for name in list(parameters)[4:]} - {"kwargs", "stock_kwargs"}

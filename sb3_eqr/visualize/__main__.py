@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
     import_packages(args.gym_packages)
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
-    env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust)
+    env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust, args.gym_packages)
     depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
     try:
         played = play(model, env, args.steps, depth, args.deterministic, args.seed)

@@ -28,8 +28,8 @@ PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
     "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show: "
     "docs/faq.md.",
-    "does not predict": "The latent model does not predict: {errors}. Train longer, with prediction_depth and aet_coef above "
-    "0; if that does not help, transition.csv shows at which step it fails.",
+    "does not predict": "The latent model does not predict: {errors}. Train longer. prediction_depth and aet_coef must be "
+    "above 0. If that does not help, transition.csv shows at which step it fails.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
 }

@@ -6,6 +6,7 @@ import importlib
 import json
 import pathlib
 import zipfile
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -70,6 +71,7 @@ def make_env(
     seed: int = 0,
     render: bool = False,
     trust: bool = False,
+    packages: Sequence[str] = (),
 ) -> VecEnv:
     """
     The environment as in training, from RL Zoo's files next to the model. Without them, Atari is preprocessed as by
@@ -83,6 +85,7 @@ def make_env(
     :param seed: seed of the first environment
     :param render: whether the environment is made to render
     :param trust: whether the files next to the model may name code that runs
+    :param packages: packages whose code they may name in any case
     :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
     :raises ImportError: if RL Zoo or the environment is not installed
     """
@@ -90,7 +93,7 @@ def make_env(
     kwargs = dict(env_kwargs or {})
     zoo = find_zoo_folder(path)
     if zoo is not None and not trust:
-        check_zoo_folder(zoo)
+        check_zoo_folder(zoo, packages)
     if zoo is not None and env_id in (None, zoo_arguments(zoo)["env"]):
         env = _zoo_env(zoo, kwargs, n_envs, seed, render)
     elif env_id is None:

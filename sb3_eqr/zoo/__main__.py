@@ -136,7 +136,7 @@ def settings_of_run(args: argparse.Namespace) -> str | None:
     from sb3_eqr.zoo.resuming import config_of
 
     try:
-        entry = config_of(args.resume, args.trust)
+        entry = config_of(args.resume, args.trust, args.gym_packages)
     except ValueError as error:
         fail(f"--resume: {error}")
     if entry is None:
@@ -201,12 +201,12 @@ def check_trained(args: argparse.Namespace) -> None:
         runs = pathlib.Path(args.folder, args.algo or "ppo").glob(f"{EnvironmentName(args.env)}_*/*.zip")
         places = {run.parent.name.rpartition("_")[2]: run for run in runs}
         ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
-        found = f" There are models in {' and '.join(map(str, ids))}: pass --exp-id." if ids else ""
+        found = "Pass -f with the folder given to train (logs by default), or train one first."
+        if ids:
+            found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."
         if places and not ids:
-            found = (
-                f" Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
-            )
-        fail(f"{error}.{found} Pass -f with the folder given to train (logs by default), or train one first.")
+            found = f"Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
+        fail(f"{error}. {found}")
 
 
 def save_where_nothing_is_shown(command: str) -> None:
@@ -254,7 +254,8 @@ def explanation(command: str, error: Exception) -> str | None:
     if "observation space is not supported" in str(error):
         return f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these."
     if "as action space" in str(error):
-        return f"{command}: {error}. These agents need discrete actions."
+        advice = "" if "Wrap the environment" in str(error) else " These agents need discrete actions."
+        return f"{command}: {str(error).rstrip('.')}.{advice}"
     if command in PLOTS and not isinstance(error, (AssertionError, NotImplementedError)):
         return f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each."
     if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):

@@ -7,16 +7,18 @@ import pathlib
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_eqr.common.arguments import DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
+from sb3_eqr.common.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.zoo.checks import fail, nearest
+from sb3_eqr.zoo.trust import wrapper_names
 
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
@@ -29,6 +31,14 @@ FLAGS = {
     "tensorboard_log": "--tensorboard-log",
     "_init_setup_model": "nothing",
 }
+
+
+def is_text_of_number(value: Any) -> bool:
+    """Whether the value is a number that was read as text, as YAML reads 1e5."""
+    try:
+        return isinstance(value, str) and np.isfinite(float(value))
+    except ValueError:
+        return False
 
 
 def is_schedule(value: Any) -> bool:
@@ -48,7 +58,7 @@ RULES = {
     "learning_starts": number(0) | NONE,
     "buffer_size": number(1),
     "normalize": FLAG | TEXT | DICTIONARY,
-    "learning_rate": number(0) | Rule("lin_ and a number (YAML reads 1e-3 as text: write 1.0e-3)", is_schedule),
+    "learning_rate": number(0) | Rule("lin_ and a number", is_schedule),
 }
 
 
@@ -139,29 +149,49 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     :param source: where the hyperparameters are from, for messages
     """
     algorithm = ALGOS[algo]
+    policy = algorithm.policy_aliases.get(entry.get("policy", ""))
+    kinds = [] if policy is None else [policy, *(kind for kind in policy.__mro__ if issubclass(kind, EqRPolicy))]
+    own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
     legal = ENTRY_KEYS | set(inspect.signature(algorithm).parameters) - FLAGS.keys()
     for key in entry:
         if key in FLAGS:
             fail(f"{source}: {key!r} is not allowed here, because RL Zoo sets it from {FLAGS[key]}.")
         if key not in legal:
-            fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}.{nearest(key, legal)}")
-    for key, rule in RULES.items():
-        if key in entry and not rule.holds(entry[key]):
-            fail(f"{source}: {key} must be {rule.says}, got {entry[key]!r}.")
-    policy = algorithm.policy_aliases.get(entry.get("policy", ""))
+            advice = f" Put it into policy_kwargs: dict({key}=...)." if key in own else nearest(key, legal)
+            fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}.{advice}")
+    check_values(entry, source)
     policy_kwargs = entry.get("policy_kwargs")
     if policy is not None and isinstance(policy_kwargs, dict):
-        kinds = [policy, *(kind for kind in policy.__mro__ if issubclass(kind, EqRPolicy))]
-        own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
         for key in policy_kwargs:
             if key not in own:
-                fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}'s policy.{nearest(key, own)}")
+                advice = " Put it beside policy_kwargs." if key in ALGORITHM else nearest(key, own)
+                fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}'s policy.{advice}")
     if issubclass(algorithm, EqRAlgorithm):
         check_wrappers(entry, algorithm.__name__, source)
 
 
+def check_values(entry: dict[str, Any], source: str) -> None:
+    """Exit with a message if a value is a number that was read as text, or if RL Zoo cannot use it."""
+    for key, value in entry.items():
+        if is_text_of_number(value):
+            written = np.format_float_positional(float(value), trim="-")
+            fail(
+                f"{source}: {key} must be a number, got the text {value!r}, which YAML does not read as one: write {written}."
+            )
+    for key, rule in RULES.items():
+        if key in entry and not rule.holds(entry[key]):
+            fail(f"{source}: {key} must be {rule.says}, got {entry[key]!r}.")
+
+
 def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:
-    """Exit with a message if RL Zoo would wrap the environment in a way that does not work with our agents."""
+    """Exit with a message if a wrapper does not exist, or does not work with our agents."""
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        for wrapper in wrapper_names(entry.get(key)):
+            module, _, kind = wrapper.rpartition(".")
+            try:
+                getattr(importlib.import_module(module), kind)
+            except (ImportError, AttributeError, ValueError) as error:
+                fail(f"{source}: {key} must name classes such as gymnasium.wrappers.TimeLimit, got {wrapper!r} ({error}).")
     if "HistoryWrapper" in str(entry.get("env_wrapper")):
         fail(
             f"{source}: RL Zoo's HistoryWrapper needs continuous actions, but {name} supports discrete ones. "

@@ -1,6 +1,7 @@
 """Resumable runs of ``sb3-eqr train``: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
 
 import pathlib
+from collections.abc import Sequence
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -80,17 +81,18 @@ def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
     return path / FOLDER if (path / FOLDER).is_dir() else path
 
 
-def config_of(path: pathlib.Path, trust: bool) -> dict[str, Any] | None:
+def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> dict[str, Any] | None:
     """
     :param path: as ``resume`` in :func:`install`, or one checkpoint
-    :param trust: whether the settings may name code of other packages
+    :param trust: whether the settings may name code of any package
+    :param packages: packages whose code they may name in any case
     :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
     :raises ValueError: if they name code of other packages
     """
     for run in (path, path.parent, path.parent.parent):
         for config in sorted(run.glob("*/config.yml")):
             if not trust:
-                check_zoo_folder(config.parent)
+                check_zoo_folder(config.parent, packages)
             entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
             return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
     return None

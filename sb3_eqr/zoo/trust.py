@@ -4,6 +4,7 @@ import ast
 import pathlib
 import pickle
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import yaml
@@ -69,15 +70,19 @@ def read_plain(path: pathlib.Path) -> dict[str, Any]:
     return found
 
 
-def check_zoo_folder(folder: pathlib.Path) -> None:
+def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None:
     """
     :param folder: folder with RL Zoo's args.yml and config.yml
-    :raises ValueError: if creating the environment from them would import or evaluate code outside ``WRAPPERS``
+    :param packages: packages that the user has named, whose code may run
+    :raises ValueError: if creating the environment from them would import or evaluate code outside ``WRAPPERS`` and
+        ``packages``
     """
     arguments, config = read_plain(folder / "args.yml"), read_plain(folder / "config.yml")
-    named = [*(arguments.get("gym_packages") or []), *([arguments["env"]] if ":" in str(arguments.get("env")) else [])]
+    package, colon, _ = str(arguments.get("env")).partition(":")
+    named = [*map(str, arguments.get("gym_packages") or []), *([package] if colon else [])]
     for key in ("env_wrapper", "vec_env_wrapper"):
-        named += [name for name in _names(config.get(key)) if not _is_harmless(name)]
+        named += [name for name in wrapper_names(config.get(key)) if not _is_harmless(name)]
+    named = [name for name in named if name not in packages and not name.startswith(tuple(f"{p}." for p in packages))]
     normalize = config.get("normalize")
     if isinstance(normalize, str):
         try:
@@ -86,7 +91,10 @@ def check_zoo_folder(folder: pathlib.Path) -> None:
             named.append(normalize)
     if named:
         found = ", ".join(map(str, named))
-        raise ValueError(f"{folder} must name only wrappers of {WRAPPERS} that write no files, got {found}. {PASS_TRUST}")
+        raise ValueError(
+            f"{folder} must name only packages given with --gym-packages, and wrappers of {', '.join(WRAPPERS)} that write no "
+            f"files, got {found}. {PASS_TRUST}"
+        )
     check_statistics(folder / "vecnormalize.pkl")
 
 
@@ -108,10 +116,10 @@ def _is_harmless(name: str) -> bool:
     return name.startswith(WRAPPERS) and not any(part in name.rpartition(".")[2] for part in WRITING)
 
 
-def _names(wrappers: Any) -> list[str]:
+def wrapper_names(wrappers: Any) -> list[str]:
     """:return: the names in RL Zoo's notation: a name, a dictionary with one key, or a list of these"""
     if wrappers is None:
         return []
     if isinstance(wrappers, (list, tuple)):
-        return [name for wrapper in wrappers for name in _names(wrapper)]
+        return [name for wrapper in wrappers for name in wrapper_names(wrapper)]
     return [str(name) for name in wrappers] if isinstance(wrappers, dict) else [str(wrappers)]

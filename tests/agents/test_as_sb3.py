@@ -72,6 +72,10 @@ def test_state_dicts_are_floats_and_counters(make, policy, env):
         ({"alpha": 0.6}, r"got an unexpected argument 'alpha'. Pass replay_buffer_kwargs=dict\(alpha=...\)"),
         ({"bogus": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'bogus'. It takes policy, env, learning_rate,.*seed"),
         (
+            {"policy_kwargs": {"aet_coef": 3}},
+            r"^policy_kwargs: 'aet_coef' is an argument of the agent. Pass aet_coef=... beside policy_kwargs\.$",
+        ),
+        (
             {"policy_kwargs": {"n_block": 3}},
             r"^policy_kwargs: EqR.*Policy got an unexpected .*'n_block'. Did you mean 'n_blocks'\?",
         ),

@@ -25,7 +25,7 @@ from tests.toys import ChainEnv, ImageEnv, PoisonEnv
     [
         ({"buffer_size": 5}, "prediction_depth \\+ 1 = 6 transitions per environment, got 5"),
         ({"policy_kwargs": {"group": "SU(2)"}}, "group must be GL\\(n\\), SE\\(n\\).*got 'SU\\(2\\)'"),
-        ({"policy_kwargs": {"group": "SO(1)"}}, "SO\\(n\\) with n >= 2"),
+        ({"policy_kwargs": {"group": "SO(1)"}}, "n is at least 2 for SO"),
         ({"policy_kwargs": {"n_blocks": 0}}, "n_blocks must be an integer >= 1( or None)?, got 0"),
         ({"policy_kwargs": {"n_blocks": 2.5}}, "n_blocks"),
         ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization must be one of"),
@@ -396,7 +396,11 @@ def test_resuming_without_vec_normalize_or_replay_buffer_warns(make, tmp_path):
     model = make(VecNormalize(make_vec_env(ChainEnv)))
     model.learn(60)
     model.save(tmp_path / "model")
-    bare = type(model).load(tmp_path / "model", make_vec_env(ChainEnv))
+    bare = type(model).load(tmp_path / "model")
+    with warnings.catch_warnings(), pytest.raises(AssertionError, match="must set the environment"):
+        warnings.simplefilter("error")
+        bare.learn(5)
+    bare.set_env(make_vec_env(ChainEnv))
     with pytest.warns(UserWarning) as caught:
         bare.learn(5)
     said = " ".join(str(warning.message) for warning in caught)

@@ -25,6 +25,7 @@ from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import encode, play
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure
 from sb3_eqr.visualize.tables import all_tables
+from sb3_eqr.zoo.trust import check_zoo_folder
 from tests.models import PAPER_FLAT
 
 STEP = 0.4
@@ -299,7 +300,7 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
     [
         ("args.yml", "a: !!python/object/apply:os.getcwd []", "must contain plain values, got: .*Pass|pass --trust"),
         ("args.yml", "env: Ring-v0\ngym_packages: [antigravity]", "got antigravity"),
-        ("args.yml", "env: antigravity:Ring-v0", "got antigravity:Ring-v0"),
+        ("args.yml", "env: antigravity:Ring-v0", "got antigravity"),
         ("config.yml", "env_wrapper: [{subprocess.run: {}}]", r"got subprocess\.run"),
         (
             "config.yml",
@@ -321,6 +322,16 @@ def test_files_next_to_the_model_are_checked_before_they_are_used(tmp_path, name
     (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(ValueError, match=message):
         loading.make_env(model, folder.parent / "best_model.zip")
+
+
+def test_packages_that_the_user_names_are_trusted_and_no_others(tmp_path):
+    (tmp_path / "args.yml").write_text("env: antigravity:Ring-v0\ngym_packages: [antigravity]")
+    wrappers = "env_wrapper: [antigravity.Wrapper]\nvec_env_wrapper: "
+    (tmp_path / "config.yml").write_text(f"{wrappers}antigravity_more.Wrapper")
+    with pytest.raises(ValueError, match=r"given with --gym-packages, and .* got antigravity_more\.Wrapper\. If"):
+        check_zoo_folder(tmp_path, ["antigravity"])
+    check_zoo_folder(tmp_path, ["antigravity", "antigravity_more"])  # reads only
+    assert "antigravity" not in sys.modules
 
 
 def test_the_algorithm_is_read_from_the_file(tmp_path):

@@ -244,12 +244,19 @@ def test_the_guarded_inverse_approximates_the_pseudo_inverse():
 
 
 @pytest.mark.parametrize(
-    "name", ["SU(2)", "SE", "SE(0)", "SO(1)", "T(-1)", "GL(2.5)", "SE(2)^0", "SE(2) x ", "", "gl(2)", "SE(2)^8 + SO(3)"]
+    "name",
+    ["SU(2)", "SE", "SE(0)", "SO(1)", "T(-1)", "GL(2.5)", "SE(2)^0", "SE(2) x ", "", "gl(2)", "SE(2)^8 + SO(3)", "GL(n)"],
 )
 def test_bad_names_raise_with_the_valid_ones(name):
     with pytest.raises(ValueError, match=r"GL\(n\), SE\(n\), T\(n\)") as error:
         make_group(name)
     assert repr(name) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["SO3", "so(3)", "so3", "SO(3"])
+def test_the_nearest_name_is_suggested(name):
+    with pytest.raises(ValueError, match=r"Did you mean SO\(3\)\?$"):
+        make_group(name)
 
 
 def test_bad_parameterization_and_generators():

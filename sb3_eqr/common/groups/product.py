@@ -64,7 +64,8 @@ class ProductGroup(Group):
 
 
 _FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")
-_LEGAL = "GL(n), SE(n), T(n) with n >= 1, SO(n) with n >= 2, none or none(n), or a product such as 'SE(2)^8 x SO(3)^4'"
+_LEGAL = "GL(n), SE(n), T(n) or SO(n) with a number for n, such as 'SE(2)', none, none(n), or a product such as "
+_LEGAL += "'SE(2)^8 x SO(3)^4'"
 NO_GROUP_SIZE = 512  # for "none" without a size: the features_dim of SB3's NatureCNN
 
 
@@ -94,10 +95,11 @@ def make_group(group: "str | Group", parameterization: str = "euler") -> Group:
 def _make_factor(part: str, name: str, parameterization: str) -> tuple[Group, int | None]:
     match = _FACTOR.fullmatch(part)
     if match is None or (match[2] is None and match[1] != "none"):
-        raise ValueError(f"group must be {_LEGAL}, got {name!r}.")
+        near = re.fullmatch(r"(GL|SE|SO|T)\(?(\d+)\)?", part.upper())
+        raise ValueError(f"group must be {_LEGAL}, got {name!r}.{f' Did you mean {near[1]}({near[2]})?' if near else ''}")
     kind, n, count = match[1], int(match[2] or NO_GROUP_SIZE), int(match[3]) if match[3] else None
     if n < (2 if kind == "SO" else 1) or count == 0:
-        raise ValueError(f"group must be {_LEGAL}, got {name!r}, whose n or number of blocks is too small.")
+        raise ValueError(f"group must be {_LEGAL}, got {name!r}: n is at least 2 for SO, else 1, and the number of blocks 1.")
     makers: dict[str, Callable[[], Group]] = {
         "GL": lambda: GL(n),
         "SE": lambda: SE(n, parameterization),

@@ -140,12 +140,14 @@ class ImageExtractor(BaseFeaturesExtractor):
             raise ValueError(
                 f"observation_space must be uint8 images (channels, height, width) in [0, 255], got {observation_space}. "
                 "Use MlpPolicy for vectors, MultiInputPolicy for dicts (both without an image features_extractor_class), "
-                "normalize_images=False for float images, and sb3_eqr.envs.minatar.ChannelsFirstImage for MinAtar."
+                "normalize_images=False for float images, and sb3_eqr.envs.minatar.ChannelsFirstImage for MinAtar. "
+                "VecNormalize (normalize in RL Zoo) needs norm_obs=False for images."
             )
         channels, height, width = observation_space.shape
         if min(height, width) < smallest:
             raise ValueError(
-                f"Images must have at least {smallest}x{smallest} pixels, got {height}x{width}. "
+                f"Images must be (channels, height, width) with at least {smallest}x{smallest} pixels, got "
+                f"{observation_space.shape}. "
                 "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])), "
                 "and shift_pixels=0: docs/own_environment.md."
             )
