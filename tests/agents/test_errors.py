@@ -221,6 +221,17 @@ def test_the_first_update_may_be_bad(make):
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
+def test_parameters_set_later_are_those_rolled_back_to(make):
+    model = make(ChainEnv()).learn(46)
+    model.set_parameters(make(ChainEnv(), seed=1).get_parameters())
+    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
+    model.replay_buffer.rewards[:] = 1e38
+    model.train(gradient_steps=2, batch_size=8)
+    with pytest.raises(FloatingPointError, match="was rolled back"):
+        model.dump_logs()
+    assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
+
+
 @EITHER
 @pytest.mark.parametrize("gradient_steps", [1, 2, 3])
 @pytest.mark.parametrize("good_rounds", [0, 1, 4])

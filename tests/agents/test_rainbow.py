@@ -169,6 +169,10 @@ def test_acting_with_the_target_network():
         online, target = (net(th.as_tensor(obs)).argmax(dim=1).numpy() for net in (model.q_net, model.q_net_target))
     assert (online != target).any()  # otherwise the test proves nothing
     assert np.array_equal(model.predict(obs, deterministic=True)[0], target)
+    th.manual_seed(0)
+    noisy = model.policy.predict(obs, deterministic=False)[0]
+    th.manual_seed(0)
+    assert np.array_equal(noisy, model.q_net_target._predict(th.as_tensor(obs), deterministic=False))
     model.policy.act_with_target = False
     assert np.array_equal(model.predict(obs, deterministic=True)[0], online)
 
@@ -495,7 +499,7 @@ def test_custom_filters():
     space = ImageEnv((4, 84, 84)).observation_space
     extractor = ConvExtractor(space, layers=[[32, 5, 5], [64, 5, 5]])
     assert extractor.features_dim == 64 * 3 * 3
-    with pytest.raises(ValueError, match="at least 25x25 pixels, got 24x24"):
+    with pytest.raises(ValueError, match=r"at least 25x25 pixels, got \(4, 24, 24\)"):
         ConvExtractor(ImageEnv((4, 24, 24)).observation_space, layers=[[32, 5, 5], [64, 5, 5]])
 
 

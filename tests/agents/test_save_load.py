@@ -162,6 +162,43 @@ def test_set_parameters(make, tmp_path):
         other.set_parameters({"policy": parameters["policy"]})
 
 
+@EITHER
+def test_the_optimisers_averages_get_the_memory_layout_of_their_parameters(make):
+    """PyTorch's fused Adam reads both in the order of memory."""
+    model = make(ImageEnv(), "CnnPolicy").learn(44)
+    parameters = deepcopy(model.get_parameters())
+    averages = [state["exp_avg"] for state in parameters["policy.optimizer"]["state"].values()]
+    expected = [average.clone() for average in averages]
+    for state in parameters["policy.optimizer"]["state"].values():
+        state["exp_avg"] = state["exp_avg"].contiguous()
+    model.set_parameters(parameters)
+    found = [(p, state["exp_avg"]) for p, state in model.policy.optimizer.state.items()]
+    assert any(not p.is_contiguous() for p, _ in found)  # channels last
+    for (parameter, average), wanted in zip(found, expected, strict=True):
+        assert average.stride() == parameter.stride() and th.equal(average, wanted)
+
+
+def test_after_another_dtype_targets_follow_the_new_tensors(make):
+    model = make(ChainEnv(), tau=0.25, policy_kwargs={"latent_norm": "batch", "latent_tau": None}).learn(44)
+    policy = model.policy.double()
+    states = [(online.state_dict(), copy.state_dict()) for online, copy in policy.target_copy.pairs]
+    expected = [
+        {
+            name: online[name].clone() if "running_" in name else 0.75 * value + 0.25 * online[name]
+            for name, value in copy.items()
+        }
+        for online, copy in states
+    ]
+    policy.update_target(0.25)
+    n_statistics = 0
+    for (_, copy), values in zip(states, expected, strict=True):
+        for name, value in values.items():
+            n_statistics += "running_" in name
+            if "num_batches" not in name:
+                th.testing.assert_close(copy[name], value, msg=name)
+    assert n_statistics > 0
+
+
 @POLICIES
 def test_policies_alone(make, policy, env, tmp_path):
     model = make(env(), policy).learn(46)

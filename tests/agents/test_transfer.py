@@ -104,6 +104,8 @@ def test_frozen_networks_can_be_unfrozen(make, tmp_path):
     before = states(model)
     model.load_representation(tmp_path / "old", freeze=False)
     assert same(before, states(model)) and not model.representation_frozen
+    fresh = make(ChainEnv(), policy_kwargs=WHITENED).policy.named_parameters()
+    assert [p.requires_grad for p in model.policy.parameters()] == [p.requires_grad for _, p in fresh]
     model.learn(46)
     assert not same(before, states(model))
 

@@ -5,9 +5,10 @@ import copy
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
-from stable_baselines3.common.vec_env import VecFrameStack
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common import objective
@@ -115,6 +116,58 @@ def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, networ
     th.testing.assert_close(target_state, expected_states(samples.observations))
     for m in range(2):
         th.testing.assert_close(target_rollout[:, m], expected_states(samples.rollout_observations[:, m]))
+
+
+@pytest.mark.parametrize("network", [{}, {"latent_tau": 0.25}, {"latent_tau": 0.25, "predictor": False}])
+def test_targets_are_projected_by_the_copy_and_without_the_predictor(make, monkeypatch, network):
+    """The two projections of the AET loss, by hand."""
+    model = trained_model(make, learning_rate=1e-2, policy_kwargs=network)
+    policy, seen = model.policy, {}
+    with th.no_grad():  # by chance, they could still be those of the start
+        for layer in filter(None, (policy.own_projection_target, policy.predictor_net)):
+            layer.bias.add_(0.5)
+    kind = type(policy.latent_model)
+    forward = kind.forward
+    monkeypatch.setattr(kind, "forward", lambda self, *args: seen.update(args=args) or forward(self, *args))
+    loss_terms(model, model.replay_buffer.sample(8))
+    project, target_project = seen["args"][7:9]
+    rows = th.randn(5, policy.state_dim)
+
+    def linear(layer, inputs):
+        return inputs @ layer.weight.T + layer.bias
+
+    online, target = (linear(layer, rows) for layer in (policy.own_projection, policy.own_projection_target))
+    assert not th.allclose(online, target)
+    online = linear(policy.predictor_net, online) if network.get("predictor", True) else online
+    th.testing.assert_close(project(rows), online)
+    th.testing.assert_close(target_project(rows), target)
+
+
+@EITHER
+def test_the_target_encodes_the_same_augmented_image(make, monkeypatch):
+    """A target that equals the online encoder gives the same x₀, although both are computed."""
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}).learn(44)
+    policy, seen = model.policy, {}
+    policy.latent_target_copy.update(1.0)
+    policy.latent_target_copy.is_exact = False
+    kind = type(policy.latent_model)
+    forward = kind.forward
+    monkeypatch.setattr(kind, "forward", lambda self, *args: seen.update(args=args) or forward(self, *args))
+    loss_terms(model, model.replay_buffer.sample(8))
+    assert seen["args"][4] is not seen["args"][0]
+    th.testing.assert_close(seen["args"][4], seen["args"][0].detach())
+
+
+def test_an_update_sees_normalised_observations_and_rewards(make, monkeypatch):
+    env = VecNormalize(make_vec_env(ChainEnv))
+    model = make(env).learn(60)
+    env.obs_rms.mean, env.obs_rms.var = np.full(3, 1000.0), np.ones(3)
+    env.ret_rms.var = np.array(1e-8)  # rewards are -1, 0 or 1
+    seen, objective_ = [], model.objective
+    monkeypatch.setattr(model, "objective", lambda *args: seen.append(args[0]) or objective_(*args))
+    model.train(1, 32)
+    assert (seen[0].observations == -env.clip_obs).all()
+    assert set(seen[0].rollout_rewards.unique().tolist()) == {-env.clip_reward, 0.0, env.clip_reward}
 
 
 def test_replay_weights_multiply_every_loss(make):
@@ -231,6 +284,15 @@ def test_augmentations_can_be_switched_off(make, off):
         th.testing.assert_close(ratios, ratios[:, :1].expand_as(ratios))
     else:
         assert not th.allclose(found, images.float(), atol=0.5)
+
+
+@pytest.mark.parametrize("normalize_images, low, high", [(False, 0.9, 1.1), (True, 0.9 / 255, 1.1 / 255)])
+def test_float_images_keep_their_scale(normalize_images, low, high):
+    """Intensities are drawn from 1 ± 0.05 clipped at two standard deviations; only bytes are divided by 255."""
+    space = spaces.Box(0, 255, (1, 36, 36), np.uint8) if normalize_images else spaces.Box(0, 1, (1, 36, 36), np.float32)
+    ones = th.ones((64, *space.shape), dtype=th.uint8 if normalize_images else th.float)
+    found = objective.Augmentation(space, normalize_images, 0, 0.05)(ones)
+    assert low - 1e-6 <= found.min() < found.max() <= high + 1e-6
 
 
 def test_the_learning_rate_is_never_negative(make):

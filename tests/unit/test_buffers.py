@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.replay import buffers
+from sb3_eqr.common.replay.frame_store import FrameStore
 
 ACTIONS = spaces.Discrete(4)
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -322,6 +323,69 @@ def test_memory_does_not_grow_once_the_ring_is_full():
     before = buffer.nbytes
     stream.feed(900, buffer)
     assert buffer.nbytes <= before * 1.15
+
+
+def prioritized(n_adds, **kwargs):
+    """A buffer of one environment with α = 0.5, and the stream that fed it; leaf i has the priority of position i."""
+    stream = Stream(VECTOR, 1)
+    buffer = PrioritizedSequenceReplayBuffer(5, VECTOR, ACTIONS, "cpu", alpha=0.5, **kwargs)
+    stream.feed(n_adds, buffer)
+    return buffer, stream
+
+
+def leaves(buffer):
+    return buffer._tree.get(np.arange(5)).tolist()
+
+
+def test_priorities_of_overwritten_starts_are_ignored():
+    buffer, stream = prioritized(5, n_steps=2)
+    assert leaves(buffer) == [1, 1, 1, 1, 0]  # the window of the newest is not complete
+    stream.feed(1, buffer)
+    buffer.update_priorities(np.array([0, 1]), th.tensor([100.0, 9.0]))
+    np.testing.assert_allclose(leaves(buffer), [0, 3, 1, 1, 1], atol=1e-6)
+    stream.feed(1, buffer)  # a new one gets the largest priority so far, which is not that of the overwritten start
+    np.testing.assert_allclose(leaves(buffer), [3, 0, 1, 1, 1], atol=1e-6)
+
+
+def test_starts_that_a_shorter_window_completes_get_the_largest_priority():
+    buffer, _ = prioritized(4, n_steps=3)
+    buffer.update_priorities(np.array([0]), th.tensor([16.0]))
+    np.testing.assert_allclose(leaves(buffer), [4, 1, 0, 0, 0], atol=1e-6)
+    buffer.n_steps = 1
+    buffer.sample(2)
+    np.testing.assert_allclose(leaves(buffer), [4, 1, 4, 4, 0], atol=1e-6)
+    buffer.n_steps = 2
+    buffer.sample(2)
+    np.testing.assert_allclose(leaves(buffer), [4, 1, 4, 0, 0], atol=1e-6)
+
+
+def test_a_reset_forgets_the_largest_priority():
+    buffer, stream = prioritized(2)
+    buffer.update_priorities(np.array([0]), th.tensor([16.0]))
+    buffer.reset()
+    stream.feed(1, buffer)
+    assert leaves(buffer) == [1, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("handle, expected", [(True, 0.0), (False, 1.0)])
+def test_timeouts_are_terminal_only_if_they_are_not_handled(handle, expected):
+    buffer = SequenceReplayBuffer(5, VECTOR, ACTIONS, "cpu", handle_timeout_termination=handle)
+    zeros, one = np.zeros((1, 3), dtype=np.float32), np.ones(1)
+    buffer.add(zeros, zeros, np.zeros(1), one, one, [{"TimeLimit.truncated": True}])
+    assert buffer.sample(1).dones.item() == expected
+
+
+def test_the_zeros_of_padding_are_never_overwritten():
+    """In a long episode, no stored stack holds the zero frame, and all frames of the ring are reused."""
+    store = FrameStore(4, 1, (2, 1), np.dtype(np.uint8), n_stack=2)
+    stacks = [[0, 1], *([i, i + 1] for i in range(1, 20)), [0, 50], [50, 51], [51, 52]]
+    for i, (stack, following) in enumerate(itertools.pairwise(stacks)):
+        if following[0] != stack[1]:  # the end of an episode
+            following = [stack[1], 99]
+        pair = np.array([stack, following], dtype=np.uint8)[:, None, :, None]
+        store.add(i % 4, *pair, overwrite=i >= 4)
+        found = store.observations(np.array([i % 4]), np.array([0]), following=False)
+        assert found.ravel().tolist() == stack
 
 
 @pytest.mark.parametrize("n_adds", [7, 95])
