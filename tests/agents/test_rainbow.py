@@ -481,6 +481,8 @@ def test_latents_are_scaled_to_the_unit_interval():
     for extractor in (ImpalaExtractor(space, rescale=True, width_scale=0.5), ConvExtractor(space, rescale=True)):
         found = extractor(th.rand(4, 3, 40, 36))
         assert found.amin() >= 0 and found.amax() <= 1 and (found.amax(dim=1) > 0.99).all() and found.shape[1] > 50
+    with_layer, images = ConvExtractor(space, rescale=True, features_dim=8), th.rand(4, 3, 40, 36)
+    th.testing.assert_close(with_layer(images), with_layer.linear(rescaled(with_layer.trunk(images))))
 
 
 @BOTH

@@ -388,6 +388,15 @@ def test_the_zeros_of_padding_are_never_overwritten():
         assert found.ravel().tolist() == stack
 
 
+def test_a_first_stack_may_hold_any_frames():
+    """Only neighbours that are equal share a slot."""
+    store = FrameStore(4, 1, (4, 1), np.dtype(np.uint8), n_stack=4)
+    stack = [7, 8, 7, 7]
+    store.add(0, *np.array([stack, [*stack[1:], 9]], dtype=np.uint8)[:, None, :, None], overwrite=False)
+    for following, expected in ((False, stack), (True, [*stack[1:], 9])):
+        assert store.observations(np.array([0]), np.array([0]), following).ravel().tolist() == expected
+
+
 @pytest.mark.parametrize("n_adds", [7, 95])
 def test_a_reset_buffer_equals_a_new_one(n_adds):
     settings = (40, IMAGES, ACTIONS, "cpu", 2)

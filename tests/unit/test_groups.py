@@ -131,6 +131,14 @@ def test_gram_schmidt_of_axes_and_of_linearly_dependent_columns(n):
     assert th.autograd.gradcheck(group.element, axes.clone().requires_grad_())
 
 
+def test_gram_schmidt_of_nearly_parallel_columns_in_float32():
+    """Subtracting once would leave rounding errors of 1e-7 in a remainder of 1e-5: columns with a cosine of 0.01."""
+    first = th.tensor([0.3, -0.2, 0.7])
+    params = th.cat([first, first + 1e-5 * th.tensor([1.0, 2.0, -1.0])])[None]
+    rotation = make_group("SO(3)", "gram-schmidt").element(params)[0]
+    th.testing.assert_close(rotation.mT @ rotation, th.eye(3), rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["SO(3)", "SE(2)", "SE(2)^2 x SO(3)", "T(2)", "GL(2)", "GL(2)^2 x SO(2)"])
 def test_actions_are_parameterized_around_the_identity(name):
     group = make_group(name, "gram-schmidt")

@@ -210,6 +210,15 @@ def test_the_gradient_has_no_mean_over_the_batch():
     assert not layer.running_mean.requires_grad
 
 
+def test_evaluation_changes_neither_the_running_mean_nor_the_gradient():
+    layer, features = Centering(3), th.randn(5, 3, requires_grad=True)
+    weights = th.randn(5, 3)
+    layer.eval()(features + 9).backward(weights)
+    th.testing.assert_close(features.grad, weights)
+    layer.update()
+    assert (layer.running_mean == 0).all()
+
+
 def test_layers_print_their_sizes():
     assert repr(NoisyLinear(3, 5)) == "NoisyLinear(in_features=3, out_features=5)"
     assert "SE(2), n_blocks=4, state_dim=24" in repr(GroupLayer(7, "SE(2)", n_blocks=4))
