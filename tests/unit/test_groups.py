@@ -146,6 +146,11 @@ def test_actions_are_parameterized_around_the_identity(name):
     assert actions.element_shape == group.element_shape and actions.name == group.name
     assert th.equal(actions.element(actions.identity_params()), group.identity())
     assert make_group(name, "exp").for_actions.num_params == actions.num_params
+    params = th.randn(5, actions.num_params, dtype=th.float64)
+    for parameterization in ("euler", "exp"):  # these are kept; Gram-Schmidt's actions have Euler angles
+        group = make_group(name, parameterization)
+        assert th.equal(group.for_actions.element(params), group.element(params))
+    assert th.equal(actions.element(params), make_group(name).element(params))
 
 
 def test_euler_and_exp_agree_on_so2():
