@@ -423,6 +423,28 @@ def test_the_interval_of_backups():
     assert layer.weight.item() == 120
 
 
+@pytest.mark.parametrize("bad, restored", [(0, 0), (1, 0), (2, 0), (3, 2), (4, 2), ("model", 2)])
+def test_the_newest_backup_known_to_be_finite_is_restored(monkeypatch, bad, restored):
+    """
+    Rounds of one update, backups at 0 and 2. The loss of an update is that of the model before it: if it is bad right after
+    a backup, the backup is bad, too.
+    """
+    monkeypatch.setattr(UpdateMonitor, "INTERVAL", 2)
+    layer = th.nn.Linear(1, 1)
+    monitor = UpdateMonitor(layer, th.optim.SGD(layer.parameters()))
+    with pytest.raises(FloatingPointError, match=f"rolled back to update {restored} "):
+        for n_updates in range(4 if bad == "model" else bad + 1):
+            monitor.collect()
+            with th.no_grad():
+                layer.weight.fill_(n_updates)
+            monitor.start_round(n_updates)
+            monitor.add({"loss": th.tensor(float("nan") if n_updates == bad else 1.0)})
+        monitor.collect()
+        layer.weight.data.fill_(float("nan"))
+        monitor.check_model(4)
+    assert layer.weight.item() == restored
+
+
 # ---------------------------------------------------------------------------------------------- optimiser, trunk
 
 
