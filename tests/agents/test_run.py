@@ -470,7 +470,10 @@ def test_vec_normalize(make):
 
 
 class Drawn(gym.Env):
-    """Random observations, in episodes that are truncated after ten steps; keeps the last one of each."""
+    """
+    Random observations and the time as reward, in episodes of ten steps, every other of which is truncated; keeps the last
+    observation of each.
+    """
 
     def __init__(self, space):
         self.observation_space, self.action_space, self.last = space, spaces.Discrete(2), []
@@ -485,7 +488,8 @@ class Drawn(gym.Env):
         found = self.observation_space.sample()
         if self.time == 10:
             self.last.append(found)
-        return found, 0.0, False, self.time == 10, {}
+        ends, truncated = self.time == 10, len(self.last) % 2 == 0
+        return found, float(self.time), ends and not truncated, ends and truncated, {}
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecMonitor], ids=["direct", "wrapped"])
@@ -497,8 +501,11 @@ def test_terminal_observations_behind_vec_normalize_are_stored_as_they_were(make
     is_kept = wrapper is not VecMonitor  # by DummyVecEnv; behind another wrapper what was clipped is lost
     model = make(VecNormalize(wrapper(DummyVecEnv([lambda: env])), clip_obs=0.5 if is_kept else 10.0), learning_starts=1_000)
     model.learn(100)
-    rows = np.flatnonzero(model.replay_buffer.timeouts[:, 0])
-    stored = model.replay_buffer._stores[""].observations(rows, np.zeros_like(rows), following=True)
+    buffer = model.replay_buffer
+    rows = np.flatnonzero(buffer.dones[:, 0])
+    assert buffer.timeouts[rows, 0].tolist() == [0, 1] * 5
+    assert buffer.rewards[:100, 0].tolist() == [*range(1, 11)] * 10
+    stored = buffer._stores[""].observations(rows, np.zeros_like(rows), following=True)
     assert len(rows) == len(env.last) == 10 and stored.dtype == dtype
     np.testing.assert_allclose(stored, env.last, atol=0 if is_kept else 1e-5)
 
