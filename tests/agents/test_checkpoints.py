@@ -29,9 +29,8 @@ def minatar():
 
 WORLDS = {
     "EqRQRDQN": (lambda: VecNormalize(make_vec_env("CartPole-v1", 2)), "MlpPolicy", {"gradient_steps": 2, "train_freq": 3}),
-    "EqRRainbow": (minatar, "CnnPolicy", {**MINATAR, "train_freq": 4, "v": None}),
+    "EqRRainbow": (minatar, "CnnPolicy", {**MINATAR, "train_freq": 4}),
 }
-WORLDS["EqRRainbow"][2].pop("v")
 
 
 def resume(algorithm, folder):
@@ -138,6 +137,15 @@ def test_a_checkpoint_that_was_removed_in_part_is_removed(tmp_path, monkeypatch)
     monkeypatch.undo()
     write_checkpoint(tmp_path, model)
     assert not list(tmp_path.glob(".*")) and len(find_checkpoints(tmp_path)) == 1
+
+
+def test_checkpoints_are_counted_from_the_first_step_of_the_run(tmp_path):
+    """A second call of learn from step 100: the next multiple of 40 is 120."""
+    model, callback = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(100), ExactCheckpointCallback(40, tmp_path)
+    model.learn(15, callback, reset_num_timesteps=False)
+    assert find_checkpoints(tmp_path) == []
+    model.learn(10, callback, reset_num_timesteps=False)
+    assert [path.name for path in find_checkpoints(tmp_path)] == ["checkpoint-000000000120"]
 
 
 @pytest.mark.parametrize("wrong", [{"save_freq": 0}, {"save_freq": 1.5}, {"keep": 0}])

@@ -82,6 +82,15 @@ def test_the_detectable_difference_of_few_runs_matches_a_t_test(n_runs):
     assert found == pytest.approx(critical * standard_error, rel=0.1)  # three standard deviations of the bootstrap
 
 
+def test_the_detectable_difference_of_several_games_matches_a_t_test():
+    """Four games far apart, two runs: the IQM is the mean over the second and third game."""
+    rng = np.random.default_rng(0)
+    first, second = rng.normal([-1e6, 0, 1, 1e6], [1, 1, 2, 1], (2, 2, 4))
+    variances = first[:, 1:3].var(axis=0, ddof=1).sum() + second[:, 1:3].var(axis=0, ddof=1).sum()
+    critical = 2.306  # Student's t, 4 games times 2 + 2 - 2 degrees of freedom, 97.5 %
+    assert detectable_difference(first, second, 500) == pytest.approx(critical * np.sqrt(variances / 2) / 2, rel=0.1)
+
+
 def test_equal_agents_are_rarely_distinguished():
     """
     At most in 11 of 100 trials: 5 % plus three standard deviations. With the bootstrap's variance and a normal quantile it
@@ -97,12 +106,12 @@ def test_equal_agents_are_rarely_distinguished():
 
 
 def test_profiles_by_hand():
-    """Two runs, two games: 3 of 4 scores are above 0.5, and so is the mean of one of two games."""
+    """Two runs, two games: 3 of 4 scores are above 0.5, and so is the mean of one of two games. 0.8 is not above 0.8."""
     matrix = np.array([[0.0, 0.6], [0.8, 1.0]])
-    taus = np.array([-1.0, 0.5, 2.0])
+    taus = np.array([-1.0, 0.5, 0.8, 2.0])
     value, low, high = performance_profile(matrix, taus, reps=20)
-    assert value.tolist() == [1, 0.75, 0] and (low <= value).all() and (value <= high).all() and low[1] < high[1]
-    assert average_score_profile(matrix, taus, reps=20)[0].tolist() == [1, 0.5, 0]
+    assert value.tolist() == [1, 0.75, 0.25, 0] and (low <= value).all() and (value <= high).all() and low[1] < high[1]
+    assert average_score_profile(matrix, taus, reps=20)[0].tolist() == [1, 0.5, 0, 0]
     _, low, high = performance_profile(np.ones((1, 2)), taus, reps=20)
     assert np.isnan(low).all() and np.isnan(high).all()
 
