@@ -488,7 +488,7 @@ class Drawn(gym.Env):
         found = self.observation_space.sample()
         if self.time == 10:
             self.last.append(found)
-        ends, truncated = self.time == 10, len(self.last) % 2 == 0
+        ends, truncated = self.time == 10, len(self.last) % 2 == 1
         return found, float(self.time), ends and not truncated, ends and truncated, {}
 
 
@@ -503,7 +503,7 @@ def test_terminal_observations_behind_vec_normalize_are_stored_as_they_were(make
     model.learn(100)
     buffer = model.replay_buffer
     rows = np.flatnonzero(buffer.dones[:, 0])
-    assert buffer.timeouts[rows, 0].tolist() == [0, 1] * 5
+    assert buffer.timeouts[rows, 0].tolist() == [1, 0] * 5
     assert buffer.rewards[:100, 0].tolist() == [*range(1, 11)] * 10
     stored = buffer._stores[""].observations(rows, np.zeros_like(rows), following=True)
     assert len(rows) == len(env.last) == 10 and stored.dtype == dtype
