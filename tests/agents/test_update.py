@@ -192,6 +192,15 @@ def test_replay_weights_multiply_every_loss(make):
         assert (n == 0).all()
 
 
+def test_the_loss_is_the_weighted_mean_of_its_terms(make):
+    model = trained_model(make)
+    samples = model.replay_buffer.sample(8)._replace(weights=th.rand(8))
+    terms = model.objective(samples, objective.LossCoefs(td=2.0, aet=0.5, symmetry=0.25, reward=3.0))
+    expected = 2.0 * terms.td + 0.5 * terms.aet + 0.25 * terms.symmetry + 3.0 * terms.reward
+    assert min(term.abs().min() for term in (terms.td, terms.aet, terms.symmetry)) > 0
+    th.testing.assert_close(terms.loss, (samples.weights * expected).mean())
+
+
 def test_new_priorities_come_from_the_td_loss(make):
     model = trained_model(make, replay_buffer_kwargs={"alpha": 0.5})
     samples = model.replay_buffer.sample(8)
