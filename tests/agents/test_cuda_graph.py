@@ -90,6 +90,55 @@ def test_a_run_needs_few_graphs(make, kwargs, monkeypatch):
     assert len(keys) > 50 and sum(a != b for a, b in itertools.pairwise(keys)) <= 1
 
 
+class Recorded(CapturedGradients):
+    """
+    A stand-in for the graph on a CPU. As a graph does, a replay reads the inputs' tensors and writes the gradients' tensors
+    of its capture, with the weights and the trained parameters of that time.
+    """
+
+    def _give_up(self, why):
+        pass
+
+    def _beside(self, coefs):
+        return self._eager(self._inputs, coefs)
+
+    def _capture(self, coefs):
+        self._graph, self._of_capture = self, (coefs, [p.requires_grad for p in self._parameters])
+        self._gradients = [th.zeros_like(p) if p.requires_grad else None for p in self._parameters]
+        return True
+
+    def replay(self):
+        coefs, trained = self._of_capture
+        now = [p.requires_grad for p in self._parameters]
+        grads = [p.grad for p in self._parameters]
+        for parameter, was_trained in zip(self._parameters, trained, strict=True):
+            parameter.requires_grad_(was_trained)
+        self._terms = self._eager(self._inputs, coefs)
+        for parameter, gradient, of_before, is_trained in zip(self._parameters, self._gradients, grads, now, strict=True):
+            if gradient is not None:
+                gradient.copy_(parameter.grad)
+            parameter.grad = of_before
+            parameter.requires_grad_(is_trained)
+
+
+def changed_run(make, **kwargs):
+    """A weight changes after 100 updates and a network is frozen after 140, both halfway between two resets."""
+    model = make(ChainEnv(), resets={"interval": 40, "end": 1.0}, tau=0.9, **kwargs).learn(90)
+    model.aet_coef = 0.25
+    model.learn(20, reset_num_timesteps=False)
+    model.policy.freeze([model.policy.online.features_extractor])
+    return model.learn(20, reset_num_timesteps=False)
+
+
+@EITHER
+def test_replays_use_the_samples_weights_and_parameters_of_their_call(make, monkeypatch):
+    monkeypatch.setattr("sb3_eqr.common.eqr_algorithm.CapturedGradients", Recorded)
+    eager, replayed = changed_run(make), changed_run(make, cuda_graph=True)
+    assert replayed._captured._graph is not None and replayed._resets.done == eager._resets.done == [40, 80, 120, 160]
+    states = [model.policy.state_dict() for model in (eager, replayed)]
+    assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+
+
 @pytest.mark.gpu
 @NEEDS_GPU
 @POLICIES
@@ -103,15 +152,8 @@ def test_captured_updates_equal_eager_ones_to_rounding(make, policy):
 @pytest.mark.gpu
 @NEEDS_GPU
 def test_changes_that_a_graph_depends_on_recapture_it(make):
-    """The captured run equals the eager one after a callback changes a weight, a network is frozen, or a reset."""
-    models = []
-    for asked in (False, True):
-        model = make(ChainEnv(), device="cuda", cuda_graph=asked, resets={"interval": 40}, tau=0.9).learn(90)
-        model.aet_coef = 0.25
-        model.learn(20, reset_num_timesteps=False)
-        model.policy.freeze([model.policy.online.features_extractor])
-        models.append(model.learn(20, reset_num_timesteps=False))
-    assert models[0]._resets.done == models[1]._resets.done != []
+    models = [changed_run(make, device="cuda", cuda_graph=asked) for asked in (False, True)]
+    assert models[0]._resets.done == models[1]._resets.done == [40, 80, 120, 160]
     assert models[1]._captured.failure is None and same_within(*models, 1e-4)
 
 

@@ -149,6 +149,20 @@ def test_the_return_distribution_is_learned():
 # ---------------------------------------------------------------------------------------------- exploration
 
 
+@pytest.mark.parametrize("is_noisy", ["online", "target"])
+def test_both_heads_are_noisy_in_an_update(make, is_noisy):
+    """Without double Q, the target head alone chooses the next action, and without auxiliary losses nothing else is random."""
+    model = make(ChainEnv(), prediction_depth=0, double_q=False).learn(46)
+    for name in ("online", "target"):
+        for layer in getattr(model.policy, name).head.modules():
+            if isinstance(layer, NoisyLinear):
+                th.nn.init.constant_(layer.weight_sigma, float(name == is_noisy))
+                th.nn.init.constant_(layer.bias_sigma, float(name == is_noisy))
+    samples = model.replay_buffer.sample(8)
+    first, second = (loss_terms(model, samples).td for _ in range(2))
+    assert not th.allclose(first, second)
+
+
 def test_noise_explores_in_eval_mode_and_changes_at_every_step():
     model = make_rainbow(ChainEnv(), learning_starts=0, exploration_initial_eps=0.0).learn(20)
     model.policy.set_training_mode(False)  # as collect_rollouts does

@@ -381,6 +381,19 @@ def test_target_networks_follow_the_online_ones(make, network):
         th.testing.assert_close(b, a + 0.5)
 
 
+@EITHER
+@pytest.mark.parametrize("tau", [1.0, 0.5])
+def test_the_target_follows_after_each_update(make, tau):
+    """So a round of four updates is the same as four rounds of one."""
+    states = []
+    for rounds in ([4], [1, 1, 1, 1]):
+        model = make(ChainEnv(), tau=tau, policy_kwargs={"latent_tau": None}).learn(46)
+        for n_updates in rounds:
+            model.train(n_updates, 8)
+        states.append(model.policy.state_dict())
+    assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+
+
 def test_exploration_is_random_then_noisy_and_prediction_is_neither(make):
     model = make(ChainEnv(), learning_starts=0, exploration_fraction=0.5)
     model.policy.online.head.advantage[-1].weight_sigma.data.fill_(1.0)

@@ -54,12 +54,12 @@ def test_a_head_on_the_trunk_needs_its_own_projection():
 
 @pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
 @pytest.mark.parametrize("share", [None, 0.02])
-@pytest.mark.parametrize("head_input", ["state", "trunk"])
-def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input):
+@pytest.mark.parametrize("head_input, double_q", [("state", True), ("trunk", True), ("trunk", False)])
+def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input, double_q):
     """Computed loss by loss: each one gives its gradient at the state and at the encoder's weights."""
     settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the only loss that samples partners
     network = {"layer_norm": True, "projection": "own", "noisy": False, "head_input": head_input}
-    model = trained(kind, **settings, policy_kwargs=network)
+    model = trained(kind, **settings, double_q=double_q, policy_kwargs=network)
     policy, samples = model.policy, model.replay_buffer.sample(8)
     weight = next(policy.online.features_extractor.parameters())  # the trunk's first weight
     states = []

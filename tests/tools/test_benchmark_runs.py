@@ -215,6 +215,16 @@ def test_short_episodes_are_not_counted_more_often(corridor):
     assert (np.random.get_state()[1] == state).all()
 
 
+def test_no_two_runs_are_evaluated_on_the_same_episodes(corridor, monkeypatch):
+    seeds, reset = [], Corridor.reset
+    monkeypatch.setattr(Corridor, "reset", lambda env, *, seed=None, **kwargs: seeds.append(seed) or reset(env, seed=seed))
+    for seed in (0, 1, 2):
+        evaluate(Fixed(), protocol(env_id=corridor, n_envs=4), 4, seed)
+    given = [seed for seed in seeds if seed is not None]
+    assert len(given) == len(set(given)) == 3 * 4
+    assert min(given) >= 1_000_000  # training has smaller seeds
+
+
 def test_epsilon_and_the_step_limit(corridor):
     """Half of the random actions are 1, and only they score."""
     limited = protocol(env_id=corridor, epsilon=0.4, max_steps=20)

@@ -82,6 +82,13 @@ def test_the_detectable_difference_of_few_runs_matches_a_t_test(n_runs):
     assert found == pytest.approx(critical * standard_error, rel=0.1)  # three standard deviations of the bootstrap
 
 
+def test_the_detectable_difference_with_different_numbers_of_runs():
+    """The runs 0, 0 and 3 have the variance 3, and the error 1 of their mean; the others are equal. 2 + 3 - 2 = 3 degrees."""
+    first, second = np.zeros((2, 1)), np.array([[0.0], [0.0], [3.0]])
+    for pair in ((first, second), (second, first)):
+        assert detectable_difference(*pair, 2_000) == pytest.approx(3.182, rel=0.05)  # Student's t, 97.5 %
+
+
 def test_the_detectable_difference_of_several_games_matches_a_t_test():
     """Four games far apart, two runs: the IQM is the mean over the second and third game."""
     rng = np.random.default_rng(0)
