@@ -38,7 +38,8 @@ OBJECTS = {
     "sb3_eqr.common.groups.matrix": ("GL", "SE", "SO", "T", "NoGroup", "MatrixLieGroup"),
     "sb3_eqr.common.groups.product": ("ProductGroup",),
 }
-SPACES = {"Box": ("low", "high", "shape", "dtype"), "Discrete": ("n", "start"), "MultiDiscrete": ("nvec",)}
+SPACES = {"Box": ("low", "high", "shape", "dtype"), "Discrete": ("n", "start", "dtype")}
+SPACES["MultiDiscrete"] = ("nvec", "start", "dtype")
 SPACES |= {"MultiBinary": ("n",), "Dict": ("spaces",), "Tuple": ("spaces",)}
 
 
@@ -98,6 +99,8 @@ def _encode_space(space: Any) -> Any:
         arguments["spaces"] = dict(arguments["spaces"])
     if "dtype" in arguments:
         arguments["dtype"] = np.dtype(arguments["dtype"]).str
+    if name == "Discrete" and space.dtype == np.int64:
+        del arguments["dtype"]  # older versions of Gymnasium, where it is always int64, have no such argument
     return {KIND: "space", "name": name, "arguments": encode(arguments)}
 
 
@@ -154,7 +157,10 @@ def _decode_dtype(value: Mapping[str, Any], trust: bool) -> th.dtype:
 def _decode_space(value: Mapping[str, Any], trust: bool) -> spaces.Space:
     if value["name"] not in SPACES:
         raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {value['name']!r}.")
-    return getattr(spaces, value["name"])(**decode(value["arguments"], trust))
+    arguments = decode(value["arguments"], trust)
+    if value["name"] == "Dict":  # which sorts the keys of a plain dict, but features extractors concatenate in their order
+        arguments["spaces"] = OrderedDict(arguments["spaces"])
+    return getattr(spaces, value["name"])(**arguments)
 
 
 def _decode_class(value: Mapping[str, Any], trust: bool) -> Any:

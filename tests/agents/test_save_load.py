@@ -11,6 +11,7 @@ import warnings
 import zipfile
 from copy import deepcopy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -216,6 +217,33 @@ def test_policies_alone(make, policy, env, tmp_path):
     model.policy.online.save(str(tmp_path / "net"))
     net = type(model.policy.online).load(str(tmp_path / "net"))
     assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
+
+
+class TwoNumbers(gym.Env):
+    """A dict whose keys are not in alphabetical order."""
+
+    observation_space = gym.spaces.Dict(velocity=gym.spaces.Box(-1, 1, (1,)), angle=gym.spaces.Box(-1, 1, (1,)))
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def observe(self):
+        return {key: self.np_random.uniform(-1, 1, 1).astype(np.float32) for key in ("velocity", "angle")}
+
+    def step(self, action):
+        return self.observe(), 0.0, False, False, {}
+
+
+def test_a_loaded_agent_reads_the_keys_of_a_dict_in_the_same_order(make, tmp_path):
+    model = make(TwoNumbers(), "MultiInputPolicy").learn(46)
+    model.save(tmp_path / "agent")
+    loaded = type(model).load(tmp_path / "agent")
+    observation = {"velocity": np.linspace(-1, 1, 20)[:, None], "angle": np.linspace(1, 0, 20)[:, None]}
+    observation = {key: value.astype(np.float32) for key, value in observation.items()}
+    tensors = {key: th.as_tensor(value) for key, value in observation.items()}
+    assert th.equal(loaded.policy.online(tensors), model.policy.online(tensors))
 
 
 def test_a_custom_group_is_saved(make, tmp_path):

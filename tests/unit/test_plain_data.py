@@ -42,6 +42,19 @@ def test_round_trip_of_values(value):
     assert "pickle" not in json.dumps(encode(value))
 
 
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_round_trip_of_discrete_spaces_keeps_dtype_and_start(dtype):
+    for space in (spaces.Discrete(3, start=2, dtype=dtype), spaces.MultiDiscrete([2, 3], dtype, start=[1, 0])):
+        found = again(space)
+        assert found == space and found.dtype == dtype and np.array_equal(found.start, space.start)
+
+
+def test_round_trip_of_dict_spaces_keeps_the_order_of_keys():
+    space = spaces.Dict(velocity=spaces.Discrete(2), angle=spaces.Dict(z=spaces.Discrete(2), a=spaces.Discrete(3)))
+    found = again(space)
+    assert list(found) == ["velocity", "angle"] and list(found["angle"]) == ["z", "a"]
+
+
 @pytest.mark.parametrize("array", [np.arange(6.0).reshape(2, 3), np.zeros((0, 2), np.uint8), np.float32(2.5), np.bool_(True)])
 def test_round_trip_of_arrays_keeps_shape_and_dtype(array):
     found = again(array)
