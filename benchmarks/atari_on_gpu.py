@@ -5,7 +5,8 @@ Train several agents on an Atari game beside each other on one GPU, and keep the
     python -m benchmarks.atari_on_gpu rows.jsonl --settings defaults defaults_off --table
 
 One process per agent, whose updates are captured (``cuda_graph=True``). Runs end after ``--steps``, or once a file ``stop``
-exists beside the rows, which are written every ten seconds.
+exists beside the rows, which are written every ten seconds. Rows of other runs in the file are kept, and finished runs are not
+repeated.
 """
 
 import argparse
@@ -76,6 +77,17 @@ def train(job: argparse.Namespace, settings: str, seed: int, rows: Any) -> None:
     model.learn(job.steps, Report(row, rows, job.rows.parent / "stop"))
 
 
+def key_of(row: dict[str, Any]) -> tuple[str, str, int]:
+    """What distinguishes a run from others."""
+    return row["game"], row["settings"], row["seed"]
+
+
+def read(rows: pathlib.Path) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """The rows of a file by run; empty without a file."""
+    lines = rows.read_text().splitlines() if rows.exists() else []
+    return {key_of(row): row for row in map(json.loads, lines)}
+
+
 def table(rows: list[dict[str, Any]], settings: list[str]) -> str:
     """
     A Markdown table of the mean score of the games that ended in each part of the training, per seed and averaged over seeds
@@ -126,22 +138,26 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="print the table of a file of rows, run nothing")
     job = parser.parse_args()
     if job.table:
-        print(table([json.loads(line) for line in job.rows.read_text().splitlines()], job.settings))
+        print(table([row for row in read(job.rows).values() if row["game"] == job.game], job.settings))
         return
-    rows = SPAWN.Queue()
+    rows, found = SPAWN.Queue(), read(job.rows)
     runs = [(settings, seed) for seed in job.seeds for settings in job.settings]
+    runs = [run for run in runs if found.get((job.game, *run), {"steps": 0})["steps"] < job.steps]
     processes = [SPAWN.Process(target=train, args=(job, *run, rows)) for run in runs]
     for process in processes:
         process.start()
-    found: dict[tuple[str, int], dict[str, Any]] = {}
-    while any(process.is_alive() for process in processes) or not rows.empty():
+    is_last = False
+    while not is_last:
+        is_last = not any(process.is_alive() for process in processes)  # the rows that they left are read once more
         until = time.monotonic() + WRITE_EVERY
-        while (left := until - time.monotonic()) > 0 and any(process.is_alive() for process in processes):
+        while time.monotonic() < until:
             try:
-                row = rows.get(timeout=min(left, 1.0))
+                row = rows.get(timeout=1.0)
             except queue.Empty:
-                continue
-            found[row["settings"], row["seed"]] = row
+                if any(process.is_alive() for process in processes):
+                    continue
+                break
+            found[key_of(row)] = max(row, found.get(key_of(row), row), key=lambda one: one["steps"])
         with atomic_write(job.rows, "jsonl") as file:
             file.write("".join(json.dumps(found[key]) + "\n" for key in sorted(found)).encode())
 

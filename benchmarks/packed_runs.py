@@ -55,7 +55,8 @@ def unpack(folder: pathlib.Path, file: pathlib.Path) -> int:
     rows = {name: row for name, row in read(file).items() if row.keys() >= set(PLANNED)}
     missing = [name for name in rows if not (folder / "runs" / name / RESULT).exists()]
     for name in missing:
-        write_json(folder / "runs" / name / PLAN, {key: rows[name][key] for key in PLANNED})
+        planned = {key: value for key, value in rows[name].items() if key in (*PLANNED, "defaults")}
+        write_json(folder / "runs" / name / PLAN, planned)
         write_json(folder / "runs" / name / RESULT, rows[name])
     for name, game, steps in sorted({(row["suite"], row["game"], row["protocol"]["steps"]) for row in rows.values()}):
         write_plan(folder, choose(load_suite(name), [game], steps), [])

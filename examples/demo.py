@@ -77,7 +77,7 @@ class Demo(BaseCallback):
 
 def is_atari(game: str) -> bool:
     """Whether it is an Atari game, rather than a gymnasium environment with an entry of its own."""
-    return game not in gym.registry
+    return game.startswith("ALE/") or game not in gym.registry
 
 
 def make_env(game: str, n_envs: int = 1, seed: int = 0, training: bool = False, render_mode: str | None = None) -> VecEnv:

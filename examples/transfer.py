@@ -126,7 +126,8 @@ def main() -> None:
                 print(line, flush=True)
                 with results.open("a") as file:
                     file.write(line + "\n")
-    print(table([json.loads(line) for line in results.read_text().splitlines()]))
+    found = [json.loads(line) for line in results.read_text().splitlines()]
+    print(table([run for run in found if run["steps"] == args.steps]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The named configurations: this package's RL Zoo YAML files as keyword arguments."""
 
 import pathlib
+import warnings
 from typing import Any
 
 from stable_baselines3.common.utils import LinearSchedule
@@ -31,6 +32,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
     :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/configurations.md describes each one
     :param env_id: the entry in that file: "atari", or the name of an environment
     :param changes: arguments that override those of the file; dictionaries are merged
+    :return: the arguments, without what RL Zoo itself reads (``ZOO_KEYS``); warns if the entry's environment is normalised
     :raises ValueError: if the file or the entry does not exist
     """
     try:
@@ -43,6 +45,12 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
         raise ValueError(f"env_id must be one of the entries {list(entries)} of configuration {name!r}, got {env_id!r}.")
+    if normalize := entries[env_id].get("normalize"):
+        warnings.warn(
+            f"configuration {name!r}, {env_id!r}: its agent is trained with normalize: {normalize}, not an argument of "
+            "the agent. Wrap the environment with stable_baselines3.common.vec_env.VecNormalize.",
+            stacklevel=2,
+        )
     arguments = {key: value for key, value in entries[env_id].items() if key not in ZOO_KEYS}
     if isinstance(arguments.get("policy_kwargs"), str):
         raise ValueError(

@@ -1,5 +1,7 @@
 """Small environments for the tests."""
 
+from collections import OrderedDict
+
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -85,3 +87,22 @@ class PoisonEnv(ChainEnv):
             elif self.where == "reward":
                 reward = self.value
         return obs, reward, terminated, truncated, info
+
+
+class DictEnv(gym.Env):
+    """Random numbers under keys that are not sorted."""
+
+    action_space = spaces.Discrete(3)
+
+    def __init__(self, keys: tuple[str, ...] = ("velocity", "angle")):
+        self.observation_space = spaces.Dict(OrderedDict((key, spaces.Box(-1, 1, (1,))) for key in keys))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def observe(self):
+        return {key: self.np_random.uniform(-1, 1, 1).astype(np.float32) for key in self.observation_space}
+
+    def step(self, action):
+        return self.observe(), 0.0, False, False, {}

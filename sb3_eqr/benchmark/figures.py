@@ -217,10 +217,12 @@ def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.
     curves = {}
     for agent in comparison.agents:
         by_run = {}
-        for run in comparison.runs(agent):
-            steps, raw = evaluation_curve(run)
-            shares = np.round(steps / steps[-1], 2)  # games may differ in steps, and the points of curves by rounding
-            by_run[run["seed"], run["game"]] = pd.Series(comparison.normalize(run["game"], raw), index=shares)
+        evaluated = {(run["seed"], run["game"]): evaluation_curve(run) for run in comparison.runs(agent)}
+        digits = max(2, *(len(str(len(steps) - 1)) for steps, _ in evaluated.values()))  # 3 for more than 100 points
+        for (seed, game), (steps, raw) in evaluated.items():
+            shares = np.round(steps / steps[-1], digits)  # games may differ in steps, and the points of curves by rounding
+            curve = pd.Series(comparison.normalize(game, raw), index=shares)
+            by_run[seed, game] = curve[~curve.index.duplicated(keep="last")]
         table = pd.DataFrame(by_run).dropna()  # points by runs
         if len(table) > 1:
             seeds = sorted({seed for seed, _ in by_run})

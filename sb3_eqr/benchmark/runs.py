@@ -101,8 +101,10 @@ class Run:
         if (self.folder / RESULT).is_file():
             return State("done", steps, 0.0)
         if self.is_locked():
-            found = self.folder / PROGRESS
-            progress = json.loads(found.read_text(encoding="utf-8")) if found.is_file() else {}
+            try:
+                progress = json.loads((self.folder / PROGRESS).read_text(encoding="utf-8"))
+            except FileNotFoundError:  # not written yet, or removed with the lock, because the run has just finished
+                progress = {}
             return State("running", progress.get("step", 0), progress.get("steps_per_second", 0.0))
         kept = find_checkpoints(self.folder)  # from which it resumes
         step = int(kept[-1].name.removeprefix(PREFIX)) if kept else 0
@@ -209,20 +211,27 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
 
     :raises ValueError: if the folder is for another suite
     """
-    path = folder / SUITE
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / f".{SUITE}.lock"):  # two commands may add games at once
+        _write_suite(folder / SUITE, suite)
+    for run in runs:
+        if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
+            write_json(run.folder / PLAN, run.description())
+
+
+def _write_suite(path: pathlib.Path, suite: Suite) -> None:
     if path.is_file():
         old = read_suite(path)
         if old.name != suite.name:
-            raise ValueError(f"{folder} must hold a benchmark of suite {suite.name!r}, got {old.name!r}. Use another folder.")
+            raise ValueError(
+                f"{path.parent} must hold a benchmark of suite {suite.name!r}, got {old.name!r}. Use another folder."
+            )
         games = [*old.games, *(game for game in suite.games if game not in old.games)]
         scores = old.normalisation.scores | suite.normalisation.scores
         normalisation = suite.normalisation.model_copy(update={"scores": scores})
         update = {"games": games, "steps": old.steps | suite.steps, "normalisation": normalisation}
         suite = suite.model_copy(update=update)
     write_suite(suite, path)
-    for run in runs:
-        if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
-            write_json(run.folder / PLAN, run.description())
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:

@@ -24,6 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.evaluation import evaluate
@@ -96,7 +97,8 @@ class Clock:
 
 class RunCallback(BaseCallback):
     """
-    Records training scores and progress, evaluates, writes checkpoints, and stops after exactly the requested steps.
+    Records training scores and progress, evaluates, writes checkpoints, and stops after exactly the requested steps; a rollout
+    that these steps cut short is not trained on.
 
     :param run: the run
     :param record: the measurements so far
@@ -138,11 +140,21 @@ class RunCallback(BaseCallback):
             self.clock.read("training_seconds")
             add_evaluation(self.model, self.run, self.record, "curve", self.curve_episodes)
             self.clock.read("seconds")
-        return self.num_timesteps < self.steps
+        return self.num_timesteps < self.steps or self.ends_rollout()
 
     def _on_training_end(self) -> None:
         self.clock.read("training_seconds")
         self.note_progress()
+
+    def ends_rollout(self) -> bool:
+        """
+        :return: whether this step is the last of a rollout. Then ``learn`` ends by itself, after the updates that belong to
+            the rollout, which it leaves out if the callback stops it.
+        """
+        if isinstance(self.model, OffPolicyAlgorithm):
+            frequency: Any = self.model.train_freq
+            return frequency.unit == TrainFrequencyUnit.STEP and self.locals["num_collected_steps"] >= frequency.frequency
+        return self.locals.get("n_steps", 0) + 1 == self.locals.get("n_rollout_steps")
 
     def is_due(self) -> bool:
         """:return: whether a point of the learning curve has been reached since the last evaluation"""
@@ -248,9 +260,6 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
         buffer: Any = getattr(model, "replay_buffer", None)
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
             buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
-        env = model.get_env()
-        assert env is not None
-        env.seed((model.seed or 0) + model.num_timesteps)  # not the episodes from the start again
     checkpoints.restore_generators(model, manifest)
     return model, decode(manifest["notes"]), is_exact
 

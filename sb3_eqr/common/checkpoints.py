@@ -13,7 +13,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_eqr.common.arguments import ALGORITHM, check, integer
 from sb3_eqr.common.env_state import CLASS, NUMBER, MissingObjectError, capture, restore
@@ -59,7 +59,8 @@ def write_checkpoint(
             "sha256": {path.name: checksum_of(path) for path in sorted(partial.iterdir())},
         }
         (partial / MANIFEST).write_text(json.dumps({**manifest, "digest": digest(manifest)}), encoding="utf-8")
-    for old in find_checkpoints(folder)[:-keep]:
+    others = [path for path in find_checkpoints(folder) if path != checkpoint]
+    for old in others[: max(len(others) + 1 - keep, 0)]:
         discard(old)
     return checkpoint
 
@@ -72,11 +73,23 @@ def discard(checkpoint: pathlib.Path) -> None:
 
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
-    """The arguments of an agent and its spaces as plain data, used to distinguish its run from others."""
+    """The arguments of an agent, its spaces and its environment as plain data, to distinguish its run from others."""
     names = [name for name in ALGORITHM if name not in ("verbose", "tensorboard_log", "device")]
     found = {name: _without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
     spaces = {"observation_space": repr(model.observation_space), "action_space": repr(model.action_space)}
-    return {**found, "resets": encode(getattr(model, "resets", None)), **spaces}
+    return {**found, "resets": encode(getattr(model, "resets", None)), **spaces, "environment": environment_name(model)}
+
+
+def environment_name(model: BaseAlgorithm) -> str | None:
+    """
+    The first environment's id at gymnasium, or the name of its class; ``None`` where it is in another process, which would
+    have to pickle it.
+    """
+    innermost = None if model.env is None else model.env.unwrapped
+    if not isinstance(innermost, DummyVecEnv):
+        return None
+    env = innermost.envs[0]
+    return type(env.unwrapped).__name__ if env.spec is None else env.spec.id
 
 
 def _without_pickles(value: Any) -> Any:
@@ -141,7 +154,8 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
 def restore_environment(model: BaseAlgorithm, checkpoint: pathlib.Path, manifest: dict[str, Any], wrappers_only: bool) -> bool:
     """
     Restore the state of an environment that is built like that of the checkpoint. If a part of it cannot be restored, only the
-    state of its vectorised wrappers is, such as the statistics of VecNormalize, and the agent begins a new episode.
+    state of its vectorised wrappers is, such as the statistics of VecNormalize, and the agent begins a new episode. Its seed
+    depends on the step, so that the run's first episodes are not played again.
 
     :param model: the loaded agent, with its environment
     :param checkpoint: the checkpoint
@@ -159,6 +173,7 @@ def restore_environment(model: BaseAlgorithm, checkpoint: pathlib.Path, manifest
             manifest["hidden"].append(error.path)
     _restore(env, checkpoint, wrappers_only=True)
     model._last_obs = None  # so that learn resets the environment
+    env.seed(None if model.seed is None else model.seed + model.num_timesteps)
     return False
 
 

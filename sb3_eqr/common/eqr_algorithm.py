@@ -401,8 +401,9 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     def _log_last_round(self, check_model: bool = False) -> None:
         """Log the metrics of the last round, which are ready by now; roll back if a metric or the model is not finite."""
         try:
-            for name, value in self._monitor.collect().items():
-                self.logger.record_mean(f"train/{name}", value)
+            for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
+                for name, value in update.items():
+                    self.logger.record_mean(f"train/{name}", value)
             if check_model:
                 self._monitor.check_model(self._n_updates)
         except BadUpdateError as error:

@@ -1,5 +1,6 @@
 """Atomic writes: files and folders are complete or absent, even with concurrent writers and killed processes."""
 
+import atexit
 import contextlib
 import errno
 import glob
@@ -8,6 +9,7 @@ import os
 import pathlib
 import shutil
 import struct
+import tempfile
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -16,7 +18,7 @@ from typing import BinaryIO
 
 try:
     import fcntl
-except ImportError:  # Windows, where leftovers of killed processes are not removed
+except ImportError:  # Windows: it does not rename what is open, so nothing is locked and leftovers are not removed
     fcntl = None  # type: ignore[assignment]
 
 
@@ -43,6 +45,13 @@ def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(partial, path)
         _sync(path.parent)
+
+
+def temporary_folder() -> pathlib.Path:
+    """A new folder that is removed when the process ends."""
+    folder = tempfile.mkdtemp(prefix="sb3-eqr-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return pathlib.Path(folder)
 
 
 def checksum(file: BinaryIO, size: int) -> str:
@@ -103,20 +112,23 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
     """
     remove_leftovers(path.parent, glob.escape(path.name))
     descriptor = None
-    while descriptor is None:  # another process may mistake it for a leftover before it is locked
+    while True:  # another process may mistake it for a leftover before it is locked
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
         partial.mkdir() if is_folder else partial.touch()
+        if fcntl is None:
+            break
         with contextlib.suppress(FileNotFoundError):
-            descriptor = _open(partial)
-            if _lock(descriptor) is False or not partial.exists():
-                os.close(descriptor)
-                descriptor = None
+            descriptor = os.open(partial, os.O_RDONLY)
+            if _lock(descriptor) is not False and partial.exists():
+                break
+            os.close(descriptor)
     try:
         with _full_disk_named(path):
             yield partial
     finally:
         _remove(partial)
-        os.close(descriptor)  # and the lock with it
+        if descriptor is not None:
+            os.close(descriptor)  # and the lock with it
 
 
 @contextmanager
@@ -141,9 +153,11 @@ def remove_leftovers(folder: pathlib.Path, names: str) -> None:
     :param folder: folder to clean
     :param names: glob pattern for the names of the files or folders that they wrote
     """
+    if fcntl is None:
+        return
     for leftover in folder.glob(f".{names}.*.partial"):
         with contextlib.suppress(OSError):
-            descriptor = _open(leftover)
+            descriptor = os.open(leftover, os.O_RDONLY)
             try:
                 if _lock(descriptor):
                     _remove(leftover)
@@ -151,21 +165,15 @@ def remove_leftovers(folder: pathlib.Path, names: str) -> None:
                 os.close(descriptor)
 
 
-def _open(path: pathlib.Path) -> int:
-    return os.open(os.devnull if os.name == "nt" and path.is_dir() else path, os.O_RDONLY)
-
-
 def _lock(descriptor: int) -> bool | None:
-    """Try to lock, and return whether it succeeded; ``None`` if this system or folder does not support locks."""
+    """Try to lock, and return whether it succeeded; ``None`` if this folder does not support locks."""
     try:
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
     except BlockingIOError:
         return False
     except OSError:
         return None
-    return None
 
 
 def _remove(path: pathlib.Path) -> None:
@@ -176,9 +184,11 @@ def _remove(path: pathlib.Path) -> None:
 
 
 def _sync(path: pathlib.Path) -> None:
-    """Flush to disk; Windows does not support this for folders."""
+    """Flush a file or folder to disk."""
+    if fcntl is None:  # Windows flushes only files that are open for writing
+        return
     with contextlib.suppress(PermissionError):
-        descriptor = _open(path)
+        descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:

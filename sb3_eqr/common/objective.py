@@ -58,7 +58,7 @@ class NextEncodings(NamedTuple):
 
     next_features: th.Tensor  # (B, F): from the target encoder, after the n-step transition; empty without TD loss
     selection_features: th.Tensor  # (B, F): the same, from the encoder of the network that chooses the next action
-    start: th.Tensor  # (B, D): x̄₀
+    start: th.Tensor  # (B, D): x̄₀, for the GET loss
     rollout: th.Tensor | None  # (B, M, D): x̄₁ ... x̄_M, for the AET loss
 
 
@@ -116,9 +116,10 @@ class Objective:
         """Encode everything that needs no gradient. The target copy sees s_t with the online encoder's augmentation."""
         policy, embedding = self.policy, self.policy.latent_model_target.embedding
         has_td, has_latent = coefs.td > 0, samples.mask is not None
+        has_start = has_latent and coefs.symmetry > 0  # only the GET loss compares with x̄₀
         is_separate, as_online = policy.latent_target is not policy.target, policy.latent_target_encodes_as_online
         of_target = [self.augment(samples.next_observations)] if has_td else []
-        of_latent = [observations] if has_latent and not as_online else []
+        of_latent = [observations] if has_start and not as_online else []
         selection, selects_apart = None, has_td and self.double_q and not policy.target_encodes_as_online
         if selects_apart and is_separate and as_online:
             of_latent = of_target  # this encoder equals the online one, so encode in one pass with the rollout
@@ -135,7 +136,7 @@ class Objective:
         next_features = next(passes) if has_td else state.new_empty(0)
         if selects_apart and selection is None:
             selection = next(passes)
-        start = embedding(next(passes)) if has_latent and not as_online else state.detach()
+        start = embedding(next(passes)) if has_start and not as_online else state.detach()
         states = list(passes)
         rolled = embedding(th.cat(states)).view(*samples.mask.shape, -1) if states and samples.mask is not None else None
         return NextEncodings(next_features, next_features if selection is None else selection, start, rolled)

@@ -298,7 +298,9 @@ class EqRPolicy(BasePolicy):
     @property
     def description(self) -> dict[str, str]:
         """Properties that the parameters' shapes do not determine, by name; saved in the model's file."""
-        return {"group": "no group" if self.group_layer is None else self.group_layer.description}
+        keys = list(self.observation_space.spaces) if isinstance(self.observation_space, spaces.Dict) else []
+        group = "no group" if self.group_layer is None else self.group_layer.description
+        return {"group": group, "observation keys": ", ".join(keys)}  # in the order in which they are concatenated
 
     def _make_latent_model(self, encoder: BaseFeaturesExtractor) -> LatentModel:
         sizes, losses = (int(self.action_space.n), self.latent_hidden_dim), (self.reward_loss, self.aet_loss)

@@ -23,10 +23,11 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
 
     :param policy: policy of either agent
     :param path: file of either agent
-    :raises ValueError: if the file is not an EqR agent, or its group, trunk or number of actions differs
+    :raises ValueError: if the file is not an EqR agent, or its group, trunk, number of actions or order of keys differs
     """
     found = _saved_parts(path, policy.device)
-    check_same_parameters({"group": policy.description["group"]}, read_data(path).get("policy_description", {}))
+    described = {name: policy.description[name] for name in ("group", "observation keys")}
+    check_same_parameters(described, read_data(path).get("policy_description", {}))
     modules = representation(policy)
     for name, module in modules.items():
         expected = {key: f"of shape {tuple(value.shape)}" for key, value in module.state_dict().items()}

@@ -69,21 +69,21 @@ class UpdateMonitor:
         self._names = list(metrics)
         self._pending.append(th.stack(list(metrics.values())))
 
-    def collect(self) -> dict[str, float]:
+    def collect(self) -> list[dict[str, float]]:
         """
         Read the metrics of the last round.
 
-        :return: their means over the round; empty if there were no updates
+        :return: those of each update, by name
         :raises BadUpdateError: if a metric is NaN or infinite; model and optimiser are rolled back
         """
         if not self._pending:
-            return {}
+            return []
         assert self._last is not None
         metrics = th.stack(self._pending).cpu().numpy()  # (updates, metrics)
         self._pending.clear()
         finite = np.isfinite(metrics)
         if finite.all():
-            return dict(zip(self._names, metrics.mean(axis=0, dtype=np.float64).tolist(), strict=True))
+            return [dict(zip(self._names, update, strict=True)) for update in metrics.tolist()]
         first = int(np.argmin(finite.all(axis=1)))
         bad_update = self._round_start + first + 1
         is_first = bad_update == self._last.n_updates + 1  # after the last backup, whose model may not be finite

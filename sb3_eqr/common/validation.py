@@ -76,8 +76,10 @@ def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | No
     """
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         array = np.asarray(array)
-        if np.issubdtype(array.dtype, np.floating) and not (is_held := np.abs(array) <= LARGEST).all():
-            return f"{array[~is_held].flat[0]}{f' of {key!r}' if key else ''}"
+        if np.issubdtype(array.dtype, np.floating):
+            is_held = np.isfinite(array) if array.dtype.itemsize <= 4 else np.abs(array) <= LARGEST
+            if not is_held.all():
+                return f"{array[~is_held].flat[0]}{f' of {key!r}' if key else ''}"
     return None
 
 
@@ -150,11 +152,11 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 
 def check_observation_space(observation_space: spaces.Space, name: str = "observation_space") -> None:
-    """Raise ValueError if it, or a space in a dict, has no axis, or is Discrete and does not start at 0."""
+    """Raise ValueError if it, or a space in a dict, has no axis, or is Discrete or MultiDiscrete and does not start at 0."""
     if isinstance(observation_space, spaces.Dict):
         for key, space in observation_space.spaces.items():
             check_observation_space(space, f"observation_space[{key!r}]")
-    if isinstance(observation_space, spaces.Discrete) and observation_space.start != 0:
+    if isinstance(observation_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(observation_space.start != 0):
         raise ValueError(
             f"{name} must start at 0, because SB3 encodes it as one-hot, got {observation_space}. "
             "Wrap the environment with gymnasium.wrappers.TransformObservation."
@@ -266,5 +268,5 @@ def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> No
         if found.get(name, expected[name]) != expected[name]:
             raise ValueError(
                 f"{name}: parameters must be for {expected[name]!r}, got parameters for {found[name]!r}. "
-                "Build the model with the policy_kwargs of the file, or use load(), which does so."
+                "Build the model with the policy_kwargs and observations of the file, or use load(), which does so."
             )

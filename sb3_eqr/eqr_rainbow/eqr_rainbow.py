@@ -10,6 +10,8 @@ from stable_baselines3.dqn import DQN
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.eqr_rainbow.policies import CnnPolicy, EqRCategoricalNetwork, EqRRainbowPolicy, MlpPolicy, MultiInputPolicy
 
+WATCHED_STEPS = 10_000
+
 
 class EqRRainbow(EqRAlgorithm, DQN):
     """
@@ -58,7 +60,8 @@ class EqRRainbow(EqRAlgorithm, DQN):
 
     def _watch_returns(self, reward: np.ndarray, dones: np.ndarray) -> None:
         """
-        Warn, once, about a reward or a discounted return to the end of an episode that lies outside the support.
+        Warn, once, about a reward or a discounted return to the end of an episode that lies outside the support. Episodes
+        longer than ``WATCHED_STEPS`` are watched in parts, so that the memory for them is bounded.
 
         :param reward: the rewards that the agent learns from, (n_envs,)
         :param dones: (n_envs,)
@@ -66,7 +69,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
         returns = list(reward)
         for rewards, now, done in zip(self._episode_rewards, reward, dones, strict=True):
             rewards.append(float(now))
-            if done:
+            if done or len(rewards) == WATCHED_STEPS:
                 returns += accumulate(reversed(rewards), lambda later, r: r + self.gamma * later)
                 rewards.clear()
         v_min, v_max = self.policy.v_min, self.policy.v_max

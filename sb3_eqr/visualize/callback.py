@@ -10,7 +10,7 @@ from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure
-from sb3_eqr.visualize.latents import check_agent, encode, replayed
+from sb3_eqr.visualize.latents import check_agent, encode, group_model, replayed
 from sb3_eqr.visualize.measures import mean_of_known
 
 NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
@@ -35,7 +35,8 @@ class LatentCallback(BaseCallback):
     :param n_windows: Number of windows, drawn with replacement
     :param pictures: Whether to log the figure, if the logger supports figures (TensorBoard does)
     :param verbose: Verbosity level: 0 for no output, 1 for a line each time it logs
-    :raises ValueError: for an argument out of range, or, when training starts, if the agent is not an EqR agent
+    :raises ValueError: for an argument out of range, or, when training starts, if the agent is not an EqR agent, or has
+        SPR's convolutional transition
     """
 
     model: EqRAlgorithm
@@ -52,6 +53,8 @@ class LatentCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         check_agent("LatentCallback", self.model)
+        if self.model.depth > 0:
+            group_model(self.model)
 
     def _on_training_start(self) -> None:
         self._looks = self.num_timesteps // self.log_freq

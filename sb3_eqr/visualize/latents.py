@@ -141,7 +141,10 @@ def group_model(model: EqRAlgorithm) -> GroupLatentModel:
     """
     found = model.policy.latent_model
     if not isinstance(found, GroupLatentModel):
-        raise ValueError(f"The agent's latent model must be a GroupLatentModel, got {type(found).__name__}.")
+        raise ValueError(
+            f"The agent's latent model must be a GroupLatentModel, got {type(found).__name__}, whose states have no blocks to "
+            'diagnose. policy_kwargs=dict(transition="group") has them.'
+        )
     return found
 
 

@@ -18,8 +18,8 @@ import sb3_eqr.envs
 from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.save_util import is_whole_model
+from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.visualize.latents import FACTOR_KEYS
-from sb3_eqr.zoo.trust import check_statistics, check_zoo_folder
 
 
 def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqRAlgorithm:

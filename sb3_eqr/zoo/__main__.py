@@ -5,7 +5,6 @@ import importlib
 import pathlib
 import runpy
 import sys
-import tempfile
 
 import gymnasium as gym
 import yaml
@@ -13,6 +12,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import StoreDict, get_model_path
 
 from sb3_eqr.common.checkpoints import read_manifest
+from sb3_eqr.common.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_algo, check_environment, check_machine, check_trained_agent, fail, nearest
@@ -124,7 +124,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     register(policy_kwargs=entry.get("policy_kwargs"))
     name = entry_name(read_file(path), args.env)
     if name.startswith("default-"):  # RL Zoo would use "default"
-        file = pathlib.Path(tempfile.mkdtemp()) / f"{args.algo}.yml"
+        file = temporary_folder() / f"{args.algo}.yml"
         file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
         print(f"Using the entry {name!r} of {path}")
         return str(file)
@@ -141,7 +141,7 @@ def settings_of_run(args: argparse.Namespace) -> str | None:
         fail(f"--resume: {error}")
     if entry is None:
         return None
-    file = pathlib.Path(tempfile.mkdtemp()) / f"{args.algo}.yml"
+    file = temporary_folder() / f"{args.algo}.yml"
     file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
     return str(file)
 

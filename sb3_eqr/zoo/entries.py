@@ -17,8 +17,8 @@ from sb3_eqr.common.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Ru
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from sb3_eqr.trust import wrapper_names
 from sb3_eqr.zoo.checks import fail, nearest
-from sb3_eqr.zoo.trust import wrapper_names
 
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}

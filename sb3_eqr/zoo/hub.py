@@ -4,12 +4,13 @@ import importlib
 import os
 import pathlib
 import shutil
-import tempfile
 from typing import Any, NoReturn
 
 import huggingface_hub
 import huggingface_sb3
 import requests
+
+from sb3_eqr.common.files import temporary_folder
 
 DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {
@@ -105,6 +106,6 @@ def provide_ffmpeg() -> None:
     if shutil.which("ffmpeg") is None:
         import imageio_ffmpeg
 
-        folder = tempfile.mkdtemp(prefix="sb3-eqr-")
-        os.symlink(imageio_ffmpeg.get_ffmpeg_exe(), os.path.join(folder, "ffmpeg"))
-        os.environ["PATH"] += os.pathsep + folder
+        folder = temporary_folder()
+        os.symlink(imageio_ffmpeg.get_ffmpeg_exe(), folder / "ffmpeg")
+        os.environ["PATH"] += f"{os.pathsep}{folder}"

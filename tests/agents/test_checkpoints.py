@@ -116,6 +116,11 @@ class GrowingEnv(ChainEnv):
         super().__init__()
         self.things = []
 
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed)
+        self.begun = float(self.np_random.random())
+        return found
+
     def step(self, action):
         self.things.append(ChainEnv())
         return super().step(action)
@@ -127,6 +132,10 @@ def test_an_environment_that_creates_objects_is_resumed_with_new_episodes(tmp_pa
         model = EqRQRDQN.resume(tmp_path, GrowingEnv())
     assert model._last_obs is None
     model.learn(20, reset_num_timesteps=False)
+    begun = model.env.envs[0].unwrapped.begun
+    first = GrowingEnv()
+    first.reset(seed=SMALL["seed"])
+    assert first.begun != begun  # the run's first episode is not played again
 
 
 def test_a_checkpoint_that_was_removed_in_part_is_removed(tmp_path, monkeypatch):
@@ -172,6 +181,22 @@ def test_different_runs_cannot_share_a_folder(checkpoint):
         EqRQRDQN("MlpPolicy", "Acrobot-v1", **SMALL).learn(60, ExactCheckpointCallback(20, folder))
     assert sorted(folder.iterdir()) == before
     EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(30, ExactCheckpointCallback(20, folder))  # the same run once more
+
+
+class OtherEnv(ChainEnv):
+    """With the same spaces."""
+
+
+def test_runs_in_different_environments_cannot_share_a_folder(checkpoint):
+    with pytest.raises(ValueError, match="environment = 'ChainEnv' there, 'OtherEnv' here"):
+        EqRQRDQN("MlpPolicy", OtherEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, checkpoint.parent))
+
+
+def test_a_checkpoint_is_never_discarded_when_it_is_written(checkpoint):
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(25)
+    for keep, left in ((3, [25, 40]), (1, [25])):
+        write_checkpoint(checkpoint.parent, model, keep=keep)
+        assert [int(path.name.removeprefix("checkpoint-")) for path in find_checkpoints(checkpoint.parent)] == left
 
 
 def test_a_run_without_a_seed_cannot_restart_in_its_folder(tmp_path):

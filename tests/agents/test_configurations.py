@@ -2,6 +2,7 @@
 
 import pathlib
 import re
+import warnings
 
 import pytest
 import torch as th
@@ -188,6 +189,16 @@ def test_changes_are_merged():
     assert changed["policy_kwargs"]["features_extractor_kwargs"] == {"width_scale": 1, "rescale": True}
     changed["policy_kwargs"]["features_extractor_kwargs"]["width_scale"] = 4
     assert changed == plain
+
+
+def test_an_entry_with_normalised_observations_warns():
+    with pytest.warns(
+        UserWarning, match=r"'eqr_rainbow', 'MountainCar-v0': its agent is trained with normalize: .*VecNormalize"
+    ):
+        assert "normalize" not in load_configuration("eqr_rainbow", "MountainCar-v0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_configuration("eqr_rainbow", "CartPole-v1")
 
 
 def test_rl_zoos_schedules_are_schedules():

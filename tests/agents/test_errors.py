@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 from benchmarks.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.eqr_rainbow import eqr_rainbow
 from tests.models import EITHER, PAPER, SMALL, loss_terms
 from tests.toys import ChainEnv, ImageEnv, PoisonEnv
 
@@ -98,6 +99,7 @@ def test_arguments_out_of_range(make, kwargs, message):
     "space, message",
     [
         (spaces.Discrete(5, start=1), "observation_space must start at 0"),
+        (spaces.MultiDiscrete([5, 2], start=[0, 1]), "observation_space must start at 0"),
         (spaces.Box(-1, 1, (), np.float32), "observation_space must have at least one axis"),
         (spaces.Dict({"a": spaces.Box(-1, 1, (), np.float32)}), r"observation_space\['a'\] must have at least one axis"),
     ],
@@ -168,10 +170,11 @@ def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, w
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_observations_of_predict_must_be_finite(make, value):
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_observations_of_predict_must_be_finite(make, value, dtype):
     model = make(ChainEnv())
     with pytest.raises(ValueError, match=f"observation must be finite, got {value}"):
-        model.predict(np.array([0.0, value, 0.0], dtype=np.float32))
+        model.predict(np.array([0.0, value, 0.0], dtype=dtype))
 
 
 def test_a_bad_first_observation_raises_before_the_first_step(make):
@@ -374,6 +377,18 @@ def test_returns_outside_the_support_warn_once(rewards, step, value):
         assert found == []
     else:
         assert len(found) == 1 and f"step {step}: a discounted return of {value} lies outside" in found[0]
+
+
+def test_an_endless_episode_is_watched_in_parts(monkeypatch):
+    """The memory is bounded, and the return of the first part is found: 6 rewards of 2, and none after them."""
+    monkeypatch.setattr(eqr_rainbow, "WATCHED_STEPS", 12)
+    env = make_vec_env(lambda: ScriptedRewards([2.0] * 6 + [0.0] * 1_000))
+    model = EqRRainbow("MlpPolicy", env, learning_starts=1_000, device="cpu", policy_kwargs={"v_max": 11.0})
+    with pytest.warns(UserWarning, match=r"step 12: a discounted return of 11.7 lies outside"):  # 2 (1 - 0.99^6) / 0.01
+        model.learn(30)
+    quiet = EqRRainbow("MlpPolicy", env, learning_starts=1_000, device="cpu", policy_kwargs={"v_max": 12.0})
+    quiet.learn(30)
+    assert len(quiet._episode_rewards[0]) == 30 - 2 * 12
 
 
 def test_returns_within_the_support_do_not_warn():

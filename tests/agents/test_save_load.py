@@ -11,7 +11,6 @@ import warnings
 import zipfile
 from copy import deepcopy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -24,7 +23,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
 from tests.models import EITHER, MAKERS, loss_terms
 from tests.resume import Save, make_env
-from tests.toys import ChainEnv, ImageEnv
+from tests.toys import ChainEnv, DictEnv, ImageEnv
 
 POLICIES = pytest.mark.parametrize(
     "policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv), ("MultiInputPolicy", SimpleMultiObsEnv)]
@@ -219,25 +218,8 @@ def test_policies_alone(make, policy, env, tmp_path):
     assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
 
 
-class TwoNumbers(gym.Env):
-    """A dict whose keys are not in alphabetical order."""
-
-    observation_space = gym.spaces.Dict(velocity=gym.spaces.Box(-1, 1, (1,)), angle=gym.spaces.Box(-1, 1, (1,)))
-    action_space = gym.spaces.Discrete(3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observe(), {}
-
-    def observe(self):
-        return {key: self.np_random.uniform(-1, 1, 1).astype(np.float32) for key in ("velocity", "angle")}
-
-    def step(self, action):
-        return self.observe(), 0.0, False, False, {}
-
-
 def test_a_loaded_agent_reads_the_keys_of_a_dict_in_the_same_order(make, tmp_path):
-    model = make(TwoNumbers(), "MultiInputPolicy").learn(46)
+    model = make(DictEnv(), "MultiInputPolicy").learn(46)
     model.save(tmp_path / "agent")
     loaded = type(model).load(tmp_path / "agent")
     observation = {"velocity": np.linspace(-1, 1, 20)[:, None], "angle": np.linspace(1, 0, 20)[:, None]}

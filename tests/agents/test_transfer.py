@@ -7,8 +7,8 @@ import torch as th
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.groups import SO
 from sb3_eqr.common.transfer import representation
-from tests.models import BOTH, MAKERS, loss_terms
-from tests.toys import ChainEnv
+from tests.models import BOTH, EITHER, MAKERS, loss_terms
+from tests.toys import ChainEnv, DictEnv
 
 QRDQN, RAINBOW = MAKERS
 WHITENED = {"whiten": True, "group": "SO(3)", "parameterization": "gram-schmidt"}
@@ -85,6 +85,18 @@ def test_a_representation_that_does_not_fit_changes_nothing(tmp_path, changes, f
     with pytest.raises(ValueError, match=found):
         model.load_representation(tmp_path / "old")
     assert same(before, states(model))
+
+
+@EITHER
+def test_keys_of_observations_must_have_the_same_order(make, tmp_path):
+    """The encoder concatenates them, so weights would multiply the wrong numbers."""
+    env, other = DictEnv(), DictEnv(("angle", "velocity"))
+    make(env, "MultiInputPolicy").save(tmp_path / "old")
+    make(env, "MultiInputPolicy").load_representation(tmp_path / "old")
+    with pytest.raises(
+        ValueError, match=r"observation keys: parameters must be for 'angle, velocity', got .*'velocity, angle'"
+    ):
+        make(other, "MultiInputPolicy").load_representation(tmp_path / "old")
 
 
 def test_a_different_kind_of_file(tmp_path):

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import GroupFeaturesExtractor
@@ -238,6 +239,16 @@ def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, en
     assert calls == [(online, 8), *following]
 
 
+@pytest.mark.parametrize("symmetry_coef, n_encoded", [(0.0, 8 * 2), (1.0, 8 + 8 * 2)])
+def test_the_target_encodes_the_first_state_for_the_get_loss_only(make, monkeypatch, symmetry_coef, n_encoded):
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}, symmetry_coef=symmetry_coef).learn(44)
+    encoder, calls = model.policy.latent_target.features_extractor, []
+    forward = type(encoder).forward
+    monkeypatch.setattr(type(encoder), "forward", lambda self, obs: calls.append((self, len(obs))) or forward(self, obs))
+    model.train(1, 8)
+    assert sum(n for network, n in calls if network is encoder) == n_encoded
+
+
 @pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])
 def test_a_pass_on_a_cpu_is_split_into_pieces(make, monkeypatch, policy, size):
     """Computing in pieces gives the same losses, to rounding."""
@@ -302,6 +313,19 @@ def test_float_images_keep_their_scale(normalize_images, low, high):
     ones = th.ones((64, *space.shape), dtype=th.uint8 if normalize_images else th.float)
     found = objective.Augmentation(space, normalize_images, 0, 0.05)(ones)
     assert low - 1e-6 <= found.min() < found.max() <= high + 1e-6
+
+
+def test_logged_losses_are_means_over_updates(make):
+    """Rounds of one and three updates: each update counts the same."""
+    model = make(ChainEnv()).learn(50)
+    model.set_logger(Logger(None, []))
+    seen = []
+    add = model._monitor.add
+    model._monitor.add = lambda metrics: (seen.append(metrics["loss"].item()), add(metrics))
+    for n in (1, 3):
+        model.train(n, 8)
+    model._log_last_round()
+    assert model.logger.name_to_value["train/loss"] == pytest.approx(np.mean(seen)) and len(seen) == 4
 
 
 def test_the_learning_rate_is_never_negative(make):

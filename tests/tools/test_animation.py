@@ -7,9 +7,11 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_eqr import EqRRainbow, load_configuration
 from sb3_eqr.common.groups import make_group
 from sb3_eqr.common.random_state import get_rng_state
 from sb3_eqr.visualize import animation
@@ -364,3 +366,10 @@ def test_an_agent_without_latent_losses_warns_once(make, off):
 def test_other_agents_raise():
     with pytest.raises(ValueError, match=r"LatentCallback needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN"):
         DQN("MlpPolicy", ChainEnv()).learn(1, callback=LatentCallback())
+
+
+def test_spr_is_refused_at_the_start():
+    model = EqRRainbow("CnnPolicy", make_vec_env(ImageEnv), device="cpu", **load_configuration("spr", buffer_size=100))
+    with pytest.raises(ValueError, match="must be a GroupLatentModel, got ConvLatentModel, whose states have no blocks"):
+        model.learn(1_000_000, callback=LatentCallback(log_freq=500_000))
+    assert model.num_timesteps == 0

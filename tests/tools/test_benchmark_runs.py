@@ -1,6 +1,9 @@
 """One run of a benchmark: its protocol, its checkpoints and its files."""
 
 import json
+import pathlib
+import threading
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +17,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from benchmarks import packed_runs
-from sb3_eqr.benchmark import training
+from sb3_eqr.benchmark import runs, training
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
 from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, SUITE, Run, Settings
@@ -407,6 +410,7 @@ def test_packed_runs_come_back(tmp_path):
     """In two parts, which the file keeps, with the suite, without unfinished runs and the machine's folders."""
     file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
     plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}}
+    plan |= {"defaults": {"gamma": 0.9}}
     plan["command"] = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml"
     for seed in (0, 1):
         path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Boxing" / str(seed) / RESULT
@@ -424,3 +428,44 @@ def test_packed_runs_come_back(tmp_path):
     assert json.loads((back / "runs/dqn/Boxing/1/run.json").read_text()) == plan | {"seed": 1, "command": command}
     suite = read_suite(back / SUITE)
     assert (suite.name, suite.games, suite.steps) == ("atari100k-5", ["Boxing"], {"Boxing": 9})
+
+
+@pytest.mark.parametrize("algo, n_updates", [("eqr_rainbow", 30), ("qrdqn", 30), ("ppo", 5)])
+def test_the_evaluated_agent_has_made_all_its_updates(algo, n_updates, tmp_path, monkeypatch):
+    """By hand: (160 - 40) / 8 rollouts after the start with 2 updates each; PPO's 160 / (16 * 2) with one epoch each."""
+    seen, add = {}, training.add_evaluation
+
+    def watched(model, run, record, kind, n_episodes):
+        seen[kind] = model._n_updates, model.num_timesteps
+        add(model, run, record, kind, n_episodes)
+
+    monkeypatch.setattr(training, "add_evaluation", watched)
+    execute(make_run(tmp_path, algo), Settings())
+    assert seen["final"] == (n_updates, STEPS)
+
+
+def test_a_run_that_ends_while_its_state_is_read_is_running(tmp_path, monkeypatch):
+    """Its progress is removed between two looks."""
+    run = make_run(tmp_path, "dqn")
+    run.folder.mkdir(parents=True)
+    monkeypatch.setattr(Run, "is_locked", lambda self: True)
+    monkeypatch.setattr(pathlib.Path, "is_file", lambda path: path.name == "progress.json")
+    assert run.state().name == "running"
+
+
+def test_two_commands_can_plan_games_in_one_folder(tmp_path, monkeypatch):
+    """The second one waits until the first one has written its games, which it keeps."""
+    suite, write = load_suite("minatar"), runs.write_suite
+    games = ["Breakout", "Asterix", "Freeway", "Seaquest"]
+
+    def slow(*args):
+        time.sleep(0.05)
+        write(*args)
+
+    monkeypatch.setattr(runs, "write_suite", slow)
+    threads = [threading.Thread(target=runs.write_plan, args=(tmp_path, choose(suite, [game], 9), [])) for game in games]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(read_suite(tmp_path / SUITE).games) == sorted(games)

@@ -1,11 +1,14 @@
 """examples/gpu_speed.py also runs completely without a GPU, which tests everything but its measurements."""
 
 import json
+import queue
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
+from benchmarks import atari_on_gpu
 from benchmarks.atari_on_gpu import table
 from benchmarks.workload import EQR_AGENTS
 from tests.tools.test_package import ROOT
@@ -61,6 +64,33 @@ def test_scores_of_several_runs_are_compared_by_part_of_the_training():
     # The game of b that ended at step 1 is too early for the last 20,000 steps.
     assert lines[3] == "| 5,000 to 25,000 | 3.3 ± 0.3 (3.7, 3.0) | 7.0 |  |"
     assert len(lines) == 4  # no run reached 40,000
+
+
+def test_a_file_of_rows_is_added_to(tmp_path, monkeypatch):
+    """Rows of other runs stay, finished runs are not repeated, and the table has the rows of its game only."""
+    rows = [{"game": game, "settings": "a", "seed": 0, "steps": 50, "games": [[9, 2.0]]} for game in ("Boxing", "Breakout")]
+    file = tmp_path / "rows.jsonl"
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    started = []
+
+    class Process:
+        def __init__(self, target, args):
+            job, settings, seed, queue = args
+            started.append((settings, seed))
+            queue.put({"game": job.game, "settings": settings, "seed": seed, "steps": 50, "games": []})
+
+        def start(self):
+            pass
+
+        def is_alive(self):
+            return False
+
+    monkeypatch.setattr(atari_on_gpu, "SPAWN", SimpleNamespace(Process=Process, Queue=queue.Queue))
+    command = ["atari_on_gpu", str(file), "--settings", "a", "b", "--seeds", "0", "--steps", "50"]
+    monkeypatch.setattr(sys, "argv", command)
+    atari_on_gpu.main()
+    assert started == [("b", 0)]
+    assert [json.loads(line)["game"] for line in file.read_text().splitlines()] == ["Boxing", "Boxing", "Breakout"]
 
 
 @pytest.mark.slow

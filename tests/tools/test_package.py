@@ -44,6 +44,12 @@ def test_importing_works_without_extras():
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
+@pytest.mark.slow
+def test_figures_need_no_rl_zoo():
+    code = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS[3:]})); import sb3_eqr.visualize.loading"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
 def test_missing_extras_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ale_py", None)
     with pytest.raises(ImportError, match=re.escape('pip install ".[atari]" in a clone of the repository')):

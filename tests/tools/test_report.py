@@ -456,6 +456,22 @@ def test_curves_are_over_fractions_of_the_steps_and_end_with_the_final_evaluatio
     assert losses["step"].tolist() == [5, 10] * 3 and (losses["value"] == 0.75).all()  # thousands: ends of twentieths
 
 
+def test_curves_of_many_points_and_of_points_that_coincide(tmp_path):
+    """201 points are half a percent apart; an evaluation that waited for a reset may be near the next one."""
+
+    def change(result):
+        scores = result["evaluations"][-1]["scores"]
+        steps = [*range(500, 100_000, 500), *([99_999] if result["game"] == "Krull" else []), 100_000]
+        curve = [{"step": step, "kind": "curve", "scores": scores, "lengths": [1] * len(scores)} for step in steps]
+        result["evaluations"] = [*curve[:-1], curve[-1] | {"kind": "final"}]
+        return result
+
+    comparison = compare([a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]}, change=change)], {}, False)
+    fractions, curves = normalized_curves(comparison)[FULL]
+    assert fractions.tolist() == pytest.approx([number / 200 for number in range(1, 201)])
+    assert curves.shape == (3, 3, 200) and curves[..., -1] == pytest.approx(matrix(FULL))
+
+
 def test_losses_between_those_logged_are_interpolated(tmp_path):
     """Twentieths of 100,000 steps: seed 0 logs in the first and third, the other seeds from the second to the fourth."""
 

@@ -20,12 +20,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, cli, visualize
+from sb3_eqr.trust import check_zoo_folder
 from sb3_eqr.visualize import loading
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import encode, play
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure
 from sb3_eqr.visualize.tables import all_tables
-from sb3_eqr.zoo.trust import check_zoo_folder
 from tests.models import PAPER_FLAT
 
 STEP = 0.4

@@ -21,9 +21,9 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
+from sb3_eqr.trust import read_plain
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
 from sb3_eqr.zoo.resuming import RngPreserving
-from sb3_eqr.zoo.trust import read_plain
 from tests.toys import ChainEnv, ImageEnv
 
 

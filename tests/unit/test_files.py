@@ -1,5 +1,8 @@
 """Files and folders are complete or absent, even with several writers."""
 
+import errno
+import fcntl
+import functools
 import io
 import multiprocessing
 import os
@@ -11,6 +14,7 @@ import zipfile
 
 import pytest
 
+from sb3_eqr.common import files
 from sb3_eqr.common.files import atomic_folder, atomic_write, is_unbroken, seal
 
 
@@ -118,3 +122,29 @@ def test_a_folder_appears_complete_and_is_not_replaced(tmp_path):
     with pytest.raises(RuntimeError), atomic_folder(tmp_path / "other"):
         raise RuntimeError
     assert names(tmp_path) == ["checkpoint"] and names(path) == ["deep"]
+
+
+def test_nothing_is_open_when_renamed_without_locks(tmp_path, monkeypatch):
+    """On Windows there is no fcntl, a folder or read-only file cannot be flushed, and what is open cannot be renamed."""
+    moved = []
+
+    def move(source, destination, real):
+        opened = [os.path.realpath(link.path) for link in os.scandir("/proc/self/fd") if os.path.exists(link.path)]
+        assert not any(str(source) in path for path in opened)
+        moved.append(destination)
+        real(source, destination)
+
+    def flush(descriptor):
+        if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+
+    monkeypatch.setattr(files, "fcntl", None)
+    monkeypatch.setattr(os, "replace", functools.partial(move, real=os.replace))
+    monkeypatch.setattr(os, "rename", functools.partial(move, real=os.rename))
+    monkeypatch.setattr(os, "fsync", flush)
+    (tmp_path / ".file.bin.old.partial").touch()
+    with atomic_write(tmp_path / "file.bin", "bin") as file, atomic_folder(tmp_path / "folder") as folder:
+        file.write(b"whole")
+        (folder / "a").write_text("first")
+    assert moved == [tmp_path / "folder", tmp_path / "file.bin"] and (tmp_path / "file.bin").read_bytes() == b"whole"
+    assert names(tmp_path) == [".file.bin.old.partial", "file.bin", "folder"] and names(tmp_path / "folder") == ["a"]

@@ -1,3 +1,5 @@
+import pickle
+
 import numpy as np
 import pytest
 import torch as th
@@ -12,6 +14,7 @@ from sb3_eqr.common.groups import (
     make_group,
 )
 from sb3_eqr.common.groups.matrix import euler_rotation, exp_rotation
+from sb3_eqr.common.plain_data import encode
 
 AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
 
@@ -229,6 +232,14 @@ def test_generators_of_so2_give_so2():
     group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]]])
     angles = th.linspace(-3, 3, 11, dtype=th.float64)[:, None]
     th.testing.assert_close(group.element(angles), make_group("SO(2)").element(angles), rtol=0, atol=1e-12)
+
+
+def test_what_a_matrix_group_computes_is_not_saved_with_it():
+    group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]]])
+    before = encode(group)
+    group.element(th.ones(2, 1, dtype=th.float32))
+    assert encode(group) == before
+    assert len(pickle.dumps(group)) == len(pickle.dumps(MatrixLieGroup(group.generators)))
 
 
 def test_without_a_group_the_transition_predicts_the_next_state():

@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch as th
 from torch.autograd.function import once_differentiable
@@ -372,11 +373,19 @@ class MatrixLieGroup(MatrixGroup):
         d, m, _ = basis.shape
         is_affine = m > 1 and not bool(basis[:, -1].any())  # if the last row of A is 0, that of exp(A) is 0 ... 0 1
         super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, m, is_affine)
-        self._placed: dict[tuple[th.dtype, th.device], th.Tensor] = {}
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        place = (params.dtype, params.device)
-        if place not in self._placed:  # copied once per device, not once per step
-            self._placed[place] = self.generators.to(dtype=params.dtype, device=params.device)
-        matrix = th.matrix_exp(th.einsum("...d,dij->...ij", params, self._placed[place]))
+        generators = _placed(self, params.dtype, params.device)
+        matrix = th.matrix_exp(th.einsum("...d,dij->...ij", params, generators))
         return matrix[..., : self.element_shape[0], :]
+
+
+_PLACED: WeakKeyDictionary[MatrixLieGroup, dict[tuple[th.dtype, th.device], th.Tensor]] = WeakKeyDictionary()
+
+
+def _placed(group: MatrixLieGroup, dtype: th.dtype, device: th.device) -> th.Tensor:
+    """The generators, copied once per device instead of once per step, and not saved with the group."""
+    copies = _PLACED.setdefault(group, {})
+    if (dtype, device) not in copies:
+        copies[dtype, device] = group.generators.to(dtype=dtype, device=device)
+    return copies[dtype, device]
