@@ -371,5 +371,5 @@ def test_other_agents_raise():
 def test_spr_is_refused_at_the_start():
     model = EqRRainbow("CnnPolicy", make_vec_env(ImageEnv), device="cpu", **load_configuration("spr", buffer_size=100))
     with pytest.raises(ValueError, match="must be a GroupLatentModel, got ConvLatentModel, whose states have no blocks"):
-        model.learn(1_000_000, callback=LatentCallback(log_freq=500_000))
+        model.learn(10, callback=LatentCallback(log_freq=1_000))
     assert model.num_timesteps == 0
