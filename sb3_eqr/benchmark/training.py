@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.utils import should_collect_more_steps
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.evaluation import evaluate
@@ -152,8 +152,9 @@ class RunCallback(BaseCallback):
             the rollout, which it leaves out if the callback stops it.
         """
         if isinstance(self.model, OffPolicyAlgorithm):
+            n_episodes = self.locals["num_collected_episodes"] + int(np.sum(self.locals["dones"]))
             frequency: Any = self.model.train_freq
-            return frequency.unit == TrainFrequencyUnit.STEP and self.locals["num_collected_steps"] >= frequency.frequency
+            return not should_collect_more_steps(frequency, self.locals["num_collected_steps"], n_episodes)
         return self.locals.get("n_steps", 0) + 1 == self.locals.get("n_rollout_steps")
 
     def is_due(self) -> bool:

@@ -88,8 +88,8 @@ def environment_name(model: BaseAlgorithm) -> str | None:
     innermost = None if model.env is None else model.env.unwrapped
     if not isinstance(innermost, DummyVecEnv):
         return None
-    env = innermost.envs[0]
-    return type(env.unwrapped).__name__ if env.spec is None else env.spec.id
+    env = innermost.envs[0].unwrapped
+    return type(env).__name__ if env.spec is None else env.spec.id
 
 
 def _without_pickles(value: Any) -> Any:
