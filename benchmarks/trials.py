@@ -2,8 +2,8 @@
 Trials of settings on small games, over games and seeds. A trial has a name and changes an entry of ``zoo_hyperparams``. Each
 run appends a row to one file, so that no result is lost and no run is repeated.
 
-    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --seeds 0 1 2 3 4 --jobs 2
-    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/trials.jsonl --table
+    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/minatar_trials.jsonl --seeds 0 1 2 --jobs 2
+    python -m benchmarks.trials benchmarks/settings/rainbow.yml --rows docs/results/minatar_trials.jsonl --table
 
 A file of trials gives the agent (a file of ``zoo_hyperparams``: eqr_rainbow, stock/qrdqn, ...) and the changes of each:
 

@@ -10,9 +10,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
+from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.common.groups import Group
 from sb3_eqr.common.latent_model import GroupLatentModel
-from sb3_eqr.common.validation import check_number
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
@@ -115,8 +115,8 @@ def train_representation(
     :raises ValueError: if an argument is out of range
     :warns UserWarning: if the representation has collapsed (:func:`~sb3_eqr.visualize.diagnostics.find_verdict`)
     """
-    check_number("still_timesteps", still_timesteps, 0, whole=True)
-    check_number("total_timesteps", total_timesteps, 1, whole=True)
+    check("still_timesteps", still_timesteps, integer(0))
+    check("total_timesteps", total_timesteps, integer(1))
     if total_timesteps <= learning_starts + still_timesteps:
         raise ValueError(
             f"total_timesteps must be > learning_starts + still_timesteps = {learning_starts + still_timesteps}, "

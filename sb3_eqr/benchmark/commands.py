@@ -13,7 +13,7 @@ from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, w
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
 from sb3_eqr.envs import import_packages
-from sb3_eqr.zoo.checks import check_machine, fail
+from sb3_eqr.zoo.checks import check_device, fail
 
 
 def check_resources(args: argparse.Namespace) -> str:
@@ -33,7 +33,7 @@ def check_resources(args: argparse.Namespace) -> str:
         )
     device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
     if args.address is None:  # the machines of a cluster may have other devices
-        check_machine(device, False, "")
+        check_device(device)
     if device.startswith("cuda") and args.gpus_per_run == 0:
         raise ValueError(f"--gpus-per-run must be > 0 with --device {device}, got 0. 0.1 puts ten runs on a GPU.")
     return device

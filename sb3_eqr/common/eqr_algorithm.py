@@ -263,7 +263,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     def _check_losses(self) -> None:
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
-        if getattr(self, "representation_frozen", False):
+        if self.representation_frozen:
             self._check_losses_of_frozen()
         validation.check_whitening(self.policy_kwargs.get("whiten", False), self.batch_size)
 

@@ -16,22 +16,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr.common.arguments import POLICY, check, integer, number
+from sb3_eqr.common.arguments import POLICY
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
-
-
-def check_number(name: str, value: Any, low: float, high: float = np.inf, whole: bool = False) -> None:
-    """
-    :param name: name of the argument
-    :param value: its value
-    :param low: smallest legal value
-    :param high: largest legal value
-    :param whole: whether it must be an integer
-    :raises ValueError: if the value is not a finite number in that range
-    """
-    check(name, value, integer(low, high) if whole else number(low, high))
 
 
 # Code that processes the values that an environment returns.

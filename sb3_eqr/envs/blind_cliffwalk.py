@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.validation import check_number
+from sb3_eqr.common.arguments import check, integer
 
 
 class BlindCliffwalk(gym.Env):
@@ -24,7 +24,7 @@ class BlindCliffwalk(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(self, n_states: int = 10, seed: int = 0, render_mode: str | None = None):
-        check_number("n_states", n_states, 1, whole=True)
+        check("n_states", n_states, integer(1))
         self.n_states = n_states
         self.render_mode = render_mode
         self.observation_space = spaces.Discrete(n_states)

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.validation import check_number
+from sb3_eqr.common.arguments import check, integer, number
 from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, enlarge
 
 # The constants of gymnasium's Pendulum-v1; mass and length are 1.
@@ -44,8 +44,8 @@ class PixelPendulum(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(self, gravity: bool = True, size: int = 48, n_torques: int = 3, render_mode: str | None = None):
-        check_number("size", size, SMALLEST_PICTURE, whole=True)
-        check_number("n_torques", n_torques, 3, whole=True)
+        check("size", size, integer(SMALLEST_PICTURE))
+        check("n_torques", n_torques, integer(3))
         if n_torques % 2 == 0:
             raise ValueError(f"n_torques must be odd, so that the middle torque is 0, got {n_torques}.")
         self.gravity = gravity
@@ -71,8 +71,8 @@ class PixelPendulum(gym.Env):
         # Always draw both, so that setting one option does not change the other draw.
         drawn = {"angle": self.np_random.uniform(-pi, pi), "velocity": self.np_random.uniform(-1, 1)}
         state = {**drawn, **options}
-        check_number("angle", state["angle"], -np.inf)
-        check_number("velocity", state["velocity"], -MAX_SPEED, MAX_SPEED)
+        check("angle", state["angle"], number())
+        check("velocity", state["velocity"], number(-MAX_SPEED, MAX_SPEED))
         self.angle = remainder(state["angle"], 2 * pi)
         self.velocity = float(state["velocity"])
         return self.draw(self.angle, self.velocity), self._info()

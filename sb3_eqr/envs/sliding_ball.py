@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.validation import check_number
+from sb3_eqr.common.arguments import check, integer
 
 SMALLEST_PICTURE = 36  # smallest image that the default convolutions of CnnPolicy accept
 ENLARGED = 4  # scale factor from an observation to a rendered image
@@ -48,10 +48,10 @@ class SlidingBall(gym.Env):
         n_distractors: int = 0,
         render_mode: str | None = None,
     ):
-        check_number("dimensions", dimensions, 1, 2, whole=True)
-        check_number("size", size, SMALLEST_PICTURE, whole=True)
-        check_number("n_steps", n_steps, 3, whole=True)
-        check_number("n_distractors", n_distractors, 0, whole=True)
+        check("dimensions", dimensions, integer(1, 2))
+        check("size", size, integer(SMALLEST_PICTURE))
+        check("n_steps", n_steps, integer(3))
+        check("n_distractors", n_distractors, integer(0))
         self.dimensions = dimensions
         self.size = size
         self.n_steps = n_steps

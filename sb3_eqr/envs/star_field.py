@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.validation import check_number
+from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, check_position, enlarge
 
 TURN = pi / 16  # rad, about 0.2; 32 turns make a full one
@@ -50,9 +50,9 @@ class StarField(gym.Env):
         layout_seed: int = 0,
         render_mode: str | None = None,
     ):
-        check_number("size", size, SMALLEST_PICTURE, whole=True)
-        check_number("n_stars", n_stars, 1, whole=True)
-        check_number("layout_seed", layout_seed, 0, whole=True)
+        check("size", size, integer(SMALLEST_PICTURE))
+        check("n_stars", n_stars, integer(1))
+        check("layout_seed", layout_seed, integer(0))
         self.translations = translations
         self.size = size
         self.render_mode = render_mode

@@ -12,12 +12,12 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
+from sb3_eqr.common.arguments import check, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.canvas import Line, Painter
 from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode, group_model
 from sb3_eqr.visualize.loading import action_names
@@ -80,12 +80,12 @@ def record(
     :raises ImportError: without the extra "visualize"
     """
     check_agent("record", model)
-    check_number("depth", depth, 1, whole=True)
-    check_number("n_steps", n_steps, depth + 1, whole=True)
+    check("depth", depth, integer(1))
+    check("n_steps", n_steps, integer(depth + 1))
     path = pathlib.Path(path)
     path = path.with_suffix("") if path.suffix[1:].lower() in FORMATS else path  # x.mp4 would become x.mp4.mp4
     fps = FPS if fps is None else fps
-    check_number("fps", fps, 1, 50)  # the limit of GIF
+    check("fps", fps, number(1, 50))  # the limit of GIF
     if not formats or set(formats) - set(FORMATS):
         raise ValueError(f"formats must be one or more of {list(FORMATS)}, got {formats!r}.")
     with preserved_rng_state(model.action_space):

@@ -6,8 +6,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
 
+from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.validation import check_number
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.latents import check_agent, encode, group_model, replayed
@@ -43,8 +43,8 @@ class LatentCallback(BaseCallback):
 
     def __init__(self, log_freq: int = 5000, n_windows: int = 256, pictures: bool = True, verbose: int = 0):
         super().__init__(verbose)
-        check_number("log_freq", log_freq, 1, whole=True)
-        check_number("n_windows", n_windows, 8, whole=True)
+        check("log_freq", log_freq, integer(1))
+        check("n_windows", n_windows, integer(8))
         self.log_freq = log_freq
         self.n_windows = n_windows
         self.pictures = pictures

@@ -12,13 +12,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.latent_model import GroupLatentModel
 from sb3_eqr.common.random_state import preserved_rng_state
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
-from sb3_eqr.common.validation import check_number
 
 CHUNK = 256  # observations encoded at once
 # Keys of ``info`` under which an environment may report its true state, as those of sb3_eqr.envs do.
@@ -86,8 +86,8 @@ def play(
     """
     check_agent("play", model)
     env = as_vec_env(model, env)
-    check_number("depth", depth, 1, whole=True)
-    check_number("n_steps", n_steps, (2 * depth + 2) * env.num_envs, whole=True)
+    check("depth", depth, integer(1))
+    check("n_steps", n_steps, integer((2 * depth + 2) * env.num_envs))
     buffer = SequenceReplayBuffer(
         n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
     )

@@ -15,7 +15,7 @@ from sb3_eqr.common.checkpoints import read_manifest
 from sb3_eqr.common.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import check_algo, check_environment, check_machine, check_trained_agent, fail, nearest
+from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail, nearest
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 
 # The functions and modules of rl_zoo3 behind each command.
@@ -112,7 +112,8 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     algo = args.algo or "ppo"
     path = find_hyperparameters(algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
-    check_machine(args.device, args.track, args.tensorboard_log)
+    check_device(args.device)
+    check_loggers(args.track, args.tensorboard_log)
     check_trained_agent(args.trained_agent)
     if path is None:
         check_entry(args.hyperparams, algo, "--hyperparams")
@@ -278,7 +279,7 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
         arguments = without_resuming(arguments)
         return arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
     if command in LOADING and args.algo is not None:
-        check_machine(args.device, False, "")
+        check_device(args.device)
         downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
         if not downloads:
             check_trained(args)

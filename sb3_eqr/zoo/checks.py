@@ -61,14 +61,18 @@ def check_environment(env_id: str, packages: list[str]) -> None:
         )
 
 
-def check_machine(device: str, track: bool, tensorboard_log: str) -> None:
-    """Exit with a message if a requested GPU, Weights & Biases or TensorBoard is not available."""
+def check_device(device: str) -> None:
+    """Exit with a message if the device is not one of PyTorch, or a GPU that is not there."""
     try:
         th.device("cpu" if device == "auto" else device)
     except RuntimeError:
         fail(f"--device must be auto, cpu, cuda or another PyTorch device, got {device!r}.")
     if device.startswith("cuda") and not th.cuda.is_available():
         fail(f"--device is {device}, but PyTorch finds no GPU. Pass --device cpu, or leave it out.")
+
+
+def check_loggers(track: bool, tensorboard_log: str) -> None:
+    """Exit with a message if Weights & Biases or TensorBoard is asked for and not installed."""
     if track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases. Run pip install wandb.")
     if (track or tensorboard_log) and importlib.util.find_spec("tensorboard") is None:

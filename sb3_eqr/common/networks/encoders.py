@@ -14,10 +14,10 @@ from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_eqr.common.arguments import check, integer, number
 from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
 from sb3_eqr.common.networks.layers import Centering, Whitening
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.common.validation import check_number
 
 DEFAULT_GROUP = "SE(2)"  # §7 and Table 5
 DEFAULT_N_BLOCKS = 12  # Table 5, for SE(2) and GL(2)
@@ -135,7 +135,7 @@ class ImageExtractor(BaseFeaturesExtractor):
         rescale: bool,
     ):
         if features_dim is not None:
-            check_number("features_dim", features_dim, 1, whole=True)
+            check("features_dim", features_dim, integer(1))
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
             raise ValueError(
                 f"observation_space must be uint8 images (channels, height, width) in [0, 255], got {observation_space}. "
@@ -202,7 +202,7 @@ class ImpalaExtractor(ImageExtractor):
         width_scale: float = 1,
         rescale: bool = False,
     ):
-        check_number("width_scale", width_scale, 1 / 16)  # at least one channel in the first stage
+        check("width_scale", width_scale, number(1 / 16))  # at least one channel in the first stage
         make_trunk = partial(ImpalaTrunk, width_scale=width_scale)
         super().__init__(observation_space, make_trunk, 1, features_dim, normalized_image, rescale)
 
@@ -217,7 +217,7 @@ class MlpExtractor(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
-        check_number("features_dim", features_dim, 1, whole=True)
+        check("features_dim", features_dim, integer(1))
         super().__init__(observation_space, features_dim)
         flat = FlattenExtractor(observation_space)
         self.layers = nn.Sequential(flat, nn.Linear(flat.features_dim, features_dim), nn.ReLU())
@@ -248,7 +248,7 @@ class DictExtractor(BaseFeaturesExtractor):
         layers: Sequence[Sequence[int]] = NATURE_LAYERS,
         mlp_output_dim: int = 256,
     ):
-        check_number("mlp_output_dim", mlp_output_dim, 1, whole=True)
+        check("mlp_output_dim", mlp_output_dim, integer(1))
         images, others = {}, {}
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
@@ -371,7 +371,7 @@ class GroupLayer(nn.Module):
         if n_blocks is None:
             n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
             n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
-        check_number("n_blocks", n_blocks, 1, whole=True)
+        check("n_blocks", n_blocks, integer(1))
         self.group = made
         self.n_blocks = n_blocks
         self.state_dim = n_blocks * prod(made.element_shape)  # D

@@ -104,7 +104,7 @@ class SequenceReplayBuffer(ReplayBuffer):
                 f"got {self.buffer_size} ({self.n_envs} environments). Pass buffer_size={needed * self.n_envs} or more."
             )
         channels = self.obs_shape[0] if isinstance(self.observation_space, spaces.Box) and self.obs_shape else 1
-        if frame_stack < 1 or channels % frame_stack != 0:
+        if channels % frame_stack != 0:
             raise ValueError(
                 f"frame_stack must divide the first axis of the observations (channels first), got {frame_stack} for "
                 f"{self.observation_space}. Pass frame_stack=1 to store observations without splitting them into frames."
