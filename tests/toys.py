@@ -106,3 +106,22 @@ class DictEnv(gym.Env):
 
     def step(self, action):
         return self.observe(), 0.0, False, False, {}
+
+
+class IntegerEnv(gym.Env):
+    """Integers, one of them Discrete and a Python int, as many environments return it; episodes of seven steps."""
+
+    observation_space = spaces.Dict({"count": spaces.Box(-9, 9, (2,), np.int64), "kind": spaces.Discrete(8)})
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.observe(), {}
+
+    def observe(self):
+        return {"count": self.np_random.integers(-9, 10, 2), "kind": self.time}
+
+    def step(self, action):
+        self.time += 1
+        return self.observe(), 1.0, self.time == 7, False, {}

@@ -260,7 +260,8 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     if not is_exact:
         buffer: Any = getattr(model, "replay_buffer", None)
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
-            buffer.timeouts[buffer.pos - 1] = True  # type: ignore[union-attr]
+            last = buffer.pos - 1
+            buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])  # a terminal state stays one
     checkpoints.restore_generators(model, manifest)
     return model, decode(manifest["notes"]), is_exact
 

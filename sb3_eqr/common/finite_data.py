@@ -103,7 +103,7 @@ class FiniteData(OffPolicyAlgorithm):
             if done and infos[i].get("terminal_observation") is not None:
                 found: Any = terminal_observation(normalize, infos, i)
                 for key in next_obs if isinstance(next_obs, dict) else [...]:
-                    into, value = (next_obs, found) if key is ... else (next_obs[key], found[key])
+                    into, value = (next_obs, np.asarray(found)) if key is ... else (next_obs[key], np.asarray(found[key]))
                     into[i] = value if value.dtype == into.dtype else rounded(value, into.dtype)
         replay_buffer.add(
             self._last_original_obs,  # type: ignore[arg-type]

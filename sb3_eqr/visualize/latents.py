@@ -1,5 +1,6 @@
 """The latent states of an agent on windows of steps: the input of all metrics, figures and animations."""
 
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import prod
@@ -7,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_eqr.common.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -88,9 +90,8 @@ def play(
     env = as_vec_env(model, env)
     check("depth", depth, integer(1))
     check("n_steps", n_steps, integer((2 * depth + 2) * env.num_envs))
-    buffer = SequenceReplayBuffer(
-        n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
-    )
+    space = normalized_space(env)
+    buffer = SequenceReplayBuffer(n_steps, space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth)
     factors: list[np.ndarray | None] = []
     with preserved_rng_state(model.action_space, env.action_space):  # the first draws random actions
         set_random_seed(seed)
@@ -111,6 +112,22 @@ def play(
     samples = buffer.windows(starts, envs)  # already normalised by a VecNormalize
     known = all(found is not None for found in factors)
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
+
+
+def normalized_space(env: VecEnv) -> spaces.Space:
+    """The space of what the environment returns: VecNormalize makes floats of integers, but keeps the space of vectors."""
+    normalize, space = unwrap_vec_normalize(env), env.observation_space
+    if normalize is None or not normalize.norm_obs:
+        return space
+    if isinstance(space, spaces.Dict):
+        keys = normalize.norm_obs_keys or []
+        return spaces.Dict(OrderedDict((key, _as_floats(part) if key in keys else part) for key, part in space.spaces.items()))
+    return _as_floats(space)
+
+
+def _as_floats(space: spaces.Space) -> spaces.Space:
+    is_integer = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer)
+    return spaces.Box(-np.inf, np.inf, space.shape, np.float32) if is_integer else space
 
 
 def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> Play:

@@ -18,7 +18,7 @@ from benchmarks.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.eqr_rainbow import eqr_rainbow
 from tests.models import EITHER, PAPER, SMALL, loss_terms
-from tests.toys import ChainEnv, ImageEnv, PoisonEnv
+from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv
 
 
 @pytest.mark.parametrize(
@@ -167,6 +167,14 @@ def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, w
         found, expected = getattr(env, name), getattr(clean, name)
         assert np.array_equal(found.mean, expected.mean) and np.array_equal(found.var, expected.var)
         assert found.count == expected.count
+
+
+def test_discrete_observations_behind_vec_normalize(make):
+    """Their terminal observation is a Python int, and it is stored."""
+    env = VecNormalize(make_vec_env(IntegerEnv), norm_obs_keys=["count"])
+    model = make(env, "MultiInputPolicy", learning_starts=1_000).learn(20)
+    stored = model.replay_buffer.windows(np.array([6]), np.array([0])).rollout_observations["kind"]
+    assert int(stored[0, 0]) == 7 and model.replay_buffer.dones[6] == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -386,12 +386,29 @@ def test_atari_games_are_saved_in_the_middle():
     assert min(lives) < lives[0] < lives[-1]  # a life was lost, and a new game has started
 
 
+def timeout_of_the_last(checkpoint, run, folder, done, timeout):
+    """The time-out of the last stored transition after an inexact resume."""
+    load = DQN.load_replay_buffer
+
+    def ended(model, *args):
+        load(model, *args)
+        last = model.replay_buffer.pos - 1
+        model.replay_buffer.dones[last], model.replay_buffer.timeouts[last] = done, timeout
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DQN, "load_replay_buffer", ended)
+        model = training.load_checkpoint(checkpoint, training.build(run, Settings(), folder / "logs")[0])[0]
+    return float(model.replay_buffer.timeouts[model.replay_buffer.pos - 1, 0])
+
+
 def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
     """LunarLander cannot be saved in the middle of an episode."""
     run = make_run(tmp_path, "dqn", game="LunarLander-v3", steps=300)
     stop_at(monkeypatch, 100)
     with pytest.raises(KeyError):
         execute(run, Settings(checkpoint_seconds=0.0))
+    ends = [(1, 0), (1, 1), (0, 0)]  # done and time-out of the last transition: only what has not ended is cut here
+    assert [timeout_of_the_last(find_checkpoints(run.folder)[-1], run, tmp_path, *end) for end in ends] == [0, 1, 1]
     counts = []
     monkeypatch.setattr(
         training.RunCallback,
