@@ -41,7 +41,17 @@ def make_model(n_states: int, seed: int, prioritized: bool) -> EqRRainbow:
         exploration_final_eps=0.1,
         prioritized_replay=prioritized,
         seed=seed,
-        policy_kwargs={"group": None, "net_arch": [], "noisy": False, "dueling": False, "v_min": 0.0, "v_max": 1.0},
+        policy_kwargs={
+            "group": None,
+            "features_extractor_class": "flatten",
+            "layer_norm": False,
+            "net_arch": [],
+            "noisy": False,
+            "dueling": False,
+            "spread_init": None,
+            "v_min": 0.0,
+            "v_max": 1.0,
+        },
     )
     model.set_logger(configure(None, []))
     sequences = list(itertools.product((0, 1), repeat=n_states))

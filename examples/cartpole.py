@@ -60,6 +60,7 @@ DQN_SETTINGS = {  # all (Zoo)
 }
 OFF = {"prediction_depth": 0, "double_q": False, "prioritized_replay": False}
 OFF_NETWORK = {"group": None, "dueling": False, "noisy": False, "v_min": 0.0, "v_max": 100.0}  # 1 / (1 - gamma)
+OFF_NETWORK |= {"features_extractor_class": "flatten", "layer_norm": False, "spread_init": None}
 DQN_NETWORK = {"net_arch": [256, 256], "optimizer_class": th.optim.Adam, "optimizer_kwargs": {"eps": 1e-8}}
 
 

@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.configurations import configuration_files
+from sb3_eqr.configurations import STOCK, configuration_files
 from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.envs.atari import atari_env_id
 from sb3_eqr.visualize import diagnose, play, record
@@ -97,7 +97,7 @@ def make_model(config: str, width_scale: float | None, game: str, seed: int, **c
         changes["policy_kwargs"] = network
     policy, entry = ("CnnPolicy", "atari") if is_atari(game) else ("MlpPolicy", game)
     settings = load_configuration(config, entry, **changes)
-    algorithm = EqRQRDQN if config == "eqr_qrdqn" else EqRRainbow
+    algorithm = EqRQRDQN if config in ("eqr_qrdqn", "qrdqn") else EqRRainbow
     return algorithm(policy, make_env(game, seed=seed, training=True), seed=seed, **settings)
 
 
@@ -190,7 +190,8 @@ def main() -> None:
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--game", default="Pong", help="any of ALE's games, or CartPole-v1")
-    parser.add_argument("--config", choices=configuration_files(), default="eqr_qrdqn", help="see docs/configurations.md")
+    ours = [name for name in configuration_files() if not name.startswith(f"{STOCK}/")]
+    parser.add_argument("--config", choices=ours, default="eqr_qrdqn", help="see docs/configurations.md")
     parser.add_argument(
         "--width-scale", type=float, help="width of eqr_bbf's networks; its paper has 4, and 1 is fast enough on two cores"
     )

@@ -1,13 +1,16 @@
 """Check the files that RL Zoo writes next to a model, before any code that they name can run."""
 
 import ast
+import importlib
 import pathlib
 import pickle
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import yaml
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 PASS_TRUST = "If you know where the file comes from, pass --trust."
 # A file may name the wrappers of these modules, except those that write files.
@@ -113,7 +116,17 @@ def check_statistics(path: pathlib.Path) -> None:
 
 
 def _is_harmless(name: str) -> bool:
-    return name.startswith(WRAPPERS) and not any(part in name.rpartition(".")[2] for part in WRITING)
+    """Whether this is a wrapper that one of the modules defines, and not another function or class that it imports."""
+    if not name.startswith(WRAPPERS):
+        return False
+    module, _, attribute = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except ImportError:
+        return False
+    if not (isinstance(found, type) and issubclass(found, (gym.Wrapper, VecEnvWrapper))):
+        return False
+    return found.__module__.startswith(WRAPPERS) and not any(part in found.__name__ for part in WRITING)
 
 
 def wrapper_names(wrappers: Any) -> list[str]:

@@ -78,7 +78,8 @@ def conclusion(analysis: Analysis) -> list[str]:
     distinct = distinct_best(own, comparison.differing, analysis.reps)
     if len(own) > 2 and any(distinct):
         best = comparison.agents[distinct.index(True)]
-        sentences.insert(0, f"{comparison.label(best)} is the best agent: these runs distinguish it from every other one.")
+        others = "every other one" + (" with the same protocol" if comparison.differing else "")
+        sentences.insert(0, f"{comparison.label(best)} is the best agent: these runs distinguish it from {others}.")
     elif len(own) > 2:
         sentences.insert(0, "No agent is the best: the one with the highest IQM is not distinguished from all others.")
     if any(abs(row["difference"]) < row["detectable"] for row in analysis.differences.to_dict("records")):
@@ -143,7 +144,8 @@ def table_notes(analysis: Analysis) -> list[str]:
     """:return: sentences on what the table of games shows"""
     comparison = analysis.comparison
     found = [
-        "Raw scores: mean ± standard deviation over runs. Bold: significantly better than every other agent.",
+        "Raw scores: mean ± standard deviation over runs. "
+        "Bold: significantly better than every other agent with the same protocol.",
         "The last rows are aggregates of normalised scores over all runs and games, with 95% intervals; "
         f"{comparison.above_one} are games with a mean above 1.",
     ]

@@ -98,7 +98,7 @@ def compare(
     if not folders:
         raise ValueError("folders must be at least one benchmark folder, got none.")
     suites = [_read_suite(folder) for folder in folders]
-    results = _of_agents(_load(folders), [*agents, *([baseline] if baseline and agents else [])])
+    results = _load(folders, [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
     games, chosen, notes = choose_runs(results, list(dict.fromkeys(g for suite in suites for g in suite.games)), force)
     if baseline is not None and baseline not in chosen:
@@ -148,17 +148,6 @@ def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suit
     return table
 
 
-def _of_agents(results: list[dict[str, Any]], agents: list[str]) -> list[dict[str, Any]]:
-    """
-    :param agents: the agents to keep; empty: all
-    :raises ValueError: for an agent without finished runs
-    """
-    there = {result["agent"] for result in results}
-    if missing := [agent for agent in agents if agent not in there]:
-        raise ValueError(f"--agents: {missing[0]!r} has no finished run.{nearest_name(missing[0], there)}")
-    return [result for result in results if not agents or result["agent"] in agents]
-
-
 def _read_suite(folder: pathlib.Path) -> Suite:
     path = pathlib.Path(folder) / "suite.yml"
     if not path.is_file():
@@ -167,14 +156,20 @@ def _read_suite(folder: pathlib.Path) -> Suite:
     return read_suite(path)
 
 
-def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
-    """:raises ValueError: for a folder without finished runs, or a run that is in two folders"""
+def _load(folders: list[pathlib.Path], agents: list[str]) -> list[dict[str, Any]]:
+    """
+    :param agents: the agents to keep; empty: all
+    :raises ValueError: for a folder or an agent without finished runs, or a run that is in two folders
+    """
     results: list[dict[str, Any]] = []
+    there: set[str] = set()
     where: dict[tuple, pathlib.Path] = {}
     for folder in map(pathlib.Path, folders):
         found = load_results(folder)
         if not found:
             raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
+        there |= {result["agent"] for result in found}
+        found = [result for result in found if not agents or result["agent"] in agents]
         for result in found:
             run = (result["agent"], result["game"], result["seed"])
             if run in where:
@@ -186,6 +181,8 @@ def _load(folders: list[pathlib.Path]) -> list[dict[str, Any]]:
                 raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]} must have a final evaluation, got none.")
             where[run] = folder
         results += found
+    if missing := [agent for agent in agents if agent not in there]:
+        raise ValueError(f"--agents: {missing[0]!r} has no finished run.{nearest_name(missing[0], there)}")
     return results
 
 

@@ -63,6 +63,9 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     return [f"{agent}: its runs differ in {', '.join(sorted(keys))}." for agent, keys in found.items()]
 
 
+ON_POLICY = ("a2c", "ppo", "ppo_lstm", "trpo")  # RL Zoo's agents that learn after a whole rollout
+
+
 def never_learn(results: list[dict[str, Any]]) -> list[str]:
     """
     :param results: results of runs, or descriptions of planned runs
@@ -70,9 +73,15 @@ def never_learn(results: list[dict[str, Any]]) -> list[str]:
     """
     found: dict[str, dict[str, None]] = {}
     for result in results:
-        starts, steps = result["entry"]["hyperparameters"].get("learning_starts", 0), result["protocol"]["steps"]
+        entry, steps = result["entry"]["hyperparameters"], result["protocol"]["steps"]
+        starts, why = entry.get("learning_starts", 0), ""
         if starts is not None and starts >= steps:  # None: a tenth of the steps or less
-            found.setdefault(result["agent"], {})[f"{result['game']} (learning_starts {starts:,} of {steps:,} steps)"] = None
+            why = f"learning_starts {starts:,}"
+        n_steps = {**result.get("defaults", {}), **entry}.get("n_steps", 0)
+        if result["entry"]["algo"] in ON_POLICY and (rollout := n_steps * entry.get("n_envs", 1)) > steps:
+            why = f"a rollout has {rollout:,}"
+        if why:
+            found.setdefault(result["agent"], {})[f"{result['game']} ({why} of {steps:,} steps)"] = None
     return [f"{agent} makes no update on {', '.join(where)}: it stays untrained." for agent, where in found.items()]
 
 

@@ -27,6 +27,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import should_collect_more_steps
 
 from sb3_eqr import envs
+from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, Run, Settings, write_json
 from sb3_eqr.common import checkpoints
@@ -34,6 +35,7 @@ from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints, write_checkpoin
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.plain_data import decode
 from sb3_eqr.common.resets import Resets
+from sb3_eqr.common.save_util import SafeFiles
 from sb3_eqr.zoo import register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
@@ -202,7 +204,8 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     args = argparse.Namespace(env=env_id, env_kwargs=kwargs, gym_packages=settings.gym_packages, seed=run.seed)
     with tempfile.TemporaryDirectory() as aside, silence():
         config = pathlib.Path(aside) / "entry.yml"
-        config.write_text(yaml.safe_dump({env_id: run.entry}), encoding="utf-8")
+        entry = {key: value for key, value in run.entry.items() if value is not None or key not in WORLD}  # null: none
+        config.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
         manager = ExperimentManager(
             args,
             run.agent.algo,
@@ -251,11 +254,12 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     """
     checkpoint, manifest = checkpoints.read_manifest(checkpoint)
     is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # SB3 does not save these
+    trust: dict[str, Any] = {"trust": True} if isinstance(model, SafeFiles) else {}  # the entry may name its own classes
     model = type(model).load(
-        checkpoint / checkpoints.MODEL, env=model.get_env(), device=model.device, force_reset=not is_exact
+        checkpoint / checkpoints.MODEL, env=model.get_env(), device=model.device, force_reset=not is_exact, **trust
     )
     if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
-        model.load_replay_buffer(checkpoint / checkpoints.BUFFER)
+        model.load_replay_buffer(checkpoint / checkpoints.BUFFER, **trust)
     is_exact = checkpoints.restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact)
     if not is_exact:
         buffer: Any = getattr(model, "replay_buffer", None)
@@ -263,6 +267,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
             last = buffer.pos - 1
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])  # a terminal state stays one
     checkpoints.restore_generators(model, manifest)
+    is_exact &= not getattr(model, "use_sde", False)  # the noise of the next rollout was drawn before the checkpoint
     return model, decode(manifest["notes"]), is_exact
 
 

@@ -153,7 +153,8 @@ def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: in
         importlib.import_module(package)
     hyperparams, stats_path = get_saved_hyperparams(str(folder))
     norm_reward = (hyperparams.get("normalize_kwargs") or {}).get("norm_reward", True)
-    made_with = {**(arguments.get("env_kwargs") or {}), **({"render_mode": "rgb_array"} if render else {}), **kwargs}
+    of_run = {**(hyperparams.pop("env_kwargs", None) or {}), **(arguments.get("env_kwargs") or {})}
+    made_with = {**of_run, **({"render_mode": "rgb_array"} if render else {}), **kwargs}
     options: dict[str, Any] = {"should_render": False, "env_kwargs": made_with, "vec_env_cls": DummyVecEnv}
     env = create_test_env(arguments["env"], n_envs, stats_path, seed, hyperparams=hyperparams, **options)
     normalize = unwrap_vec_normalize(env)

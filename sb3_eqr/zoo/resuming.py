@@ -49,6 +49,8 @@ class ResumableExperiment(ExperimentManager):
 
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""
+        if self.resume is not None and not self.eval_env_kwargs:
+            self.eval_env_kwargs = self.env_kwargs  # RL Zoo looks at the command line only, which need not repeat the run's
         super().create_callbacks()
         if self.checkpoint_every is not None or self.resume is not None:
             # RL Zoo evaluates Atari's agents with random actions, and a resumed run evaluates them at other steps.
@@ -62,7 +64,7 @@ class ResumableExperiment(ExperimentManager):
             return super()._load_pretrained_agent(hyperparams, env)
         model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
         if self.n_timesteps <= model.num_timesteps:
-            fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {self.n_timesteps}.")
+            fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {model.num_timesteps}.")
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         return model
@@ -93,6 +95,8 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
         for config in sorted(run.glob("*/config.yml")):
             if not trust:
                 check_zoo_folder(config.parent, packages)
+            if not (config.parent / "args.yml").is_file():
+                raise ValueError(f"{config.parent} must have args.yml beside config.yml, as RL Zoo writes it, got none.")
             entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
             return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
     return None

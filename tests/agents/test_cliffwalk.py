@@ -44,6 +44,13 @@ def test_the_replay_buffer_holds_every_sequence_once():
     assert buffer.rewards.sum() == 1 and buffer.dones.sum() == 2**5
 
 
+def test_the_example_is_tabular():
+    """One row of weights per state and action, and the first numbers of docs/results/cliffwalk.json."""
+    parameters = dict(make_model(4, 0, True).policy.online.named_parameters())
+    assert [tuple(value.shape) for value in parameters.values()] == [(2 * 51, 4), (2 * 51,)]
+    assert (updates_needed(4, 0, False), updates_needed(4, 0, True)) == (162, 124)
+
+
 @pytest.mark.slow
 def test_prioritised_replay_needs_fewer_updates():
     """`python examples/blind_cliffwalk.py` tests this with 10 seeds and longer walks: docs/results/cliffwalk.md."""

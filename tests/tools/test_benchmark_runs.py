@@ -14,7 +14,7 @@ from rl_zoo3.utils import create_test_env, get_saved_hyperparams
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from benchmarks import packed_runs
 from sb3_eqr.benchmark import runs, training
@@ -486,3 +486,37 @@ def test_two_commands_can_plan_games_in_one_folder(tmp_path, monkeypatch):
     for thread in threads:
         thread.join()
     assert sorted(read_suite(tmp_path / SUITE).games) == sorted(games)
+
+
+def test_an_agent_with_a_class_of_its_own_resumes(tmp_path, monkeypatch):
+    """Its checkpoint holds a pickle of the class, which the entry has already run."""
+    (tmp_path / "my_extractor.py").write_text(
+        "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    own = "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_extractor').Mine)"
+    entry = f'{{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, policy_kwargs: "{own}"}}'
+    run = make_run(tmp_path, "eqr_qrdqn", entry)
+    stop_at(monkeypatch, 100)
+    with pytest.raises(KeyError, match="stopped at"):
+        execute(run, Settings(checkpoint_seconds=0.0))
+    assert execute(run, Settings()) == "finished" and result_of(run)["resumed_exactly"]
+
+
+def test_the_noise_of_gsde_is_not_restored(tmp_path, monkeypatch):
+    entry = "{policy: MlpPolicy, n_timesteps: 1000, n_steps: 32, batch_size: 8, n_epochs: 1, use_sde: true}"
+    run = make_run(tmp_path, "ppo", entry, game="Pendulum-v1")
+    stop_at(monkeypatch, 100)
+    with pytest.raises(KeyError, match="stopped at"):
+        execute(run, Settings(checkpoint_seconds=0.0))
+    execute(run, Settings())
+    assert not result_of(run)["resumed_exactly"]
+
+
+def test_models_of_runs_without_wrappers_are_saved_without_them(tmp_path):
+    """RL Zoo reads "null" in a saved entry as a wrapper or a number of frames."""
+    run = make_run(tmp_path, "dqn", AGENTS["dqn"] + "  frame_stack: null\n  vec_env_wrapper: null\n")
+    execute(run, Settings(save_models=True))
+    folder = next(run.folder.glob("models/dqn/*/CartPole-v1"))
+    hyperparams, stats = get_saved_hyperparams(str(folder))
+    create_test_env("CartPole-v1", 1, stats, 0, hyperparams=hyperparams, vec_env_cls=DummyVecEnv, should_render=False).close()

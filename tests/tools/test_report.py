@@ -388,6 +388,24 @@ def test_equal_scores_are_not_bold(tmp_path, not_drawn):
     assert "<b>" not in text_of(page) and "qrdqn and dqn have the same IQM." in text_of(page)
 
 
+def test_runs_that_are_left_out_may_be_in_two_folders(tmp_path):
+    names = list(SCORES)[:3]
+    folders = [a_benchmark(tmp_path / name, {key: SCORES[key] for key in (names[0], name)}) for name in names[1:]]
+    assert sorted(compare(folders, {}, False, names[1:]).agents) == sorted(names[1:])
+    with pytest.raises(ValueError, match="must be in one folder"):
+        compare(folders, {}, False)
+
+
+def test_rollouts_longer_than_the_training_are_reported(tmp_path):
+    def change(result):
+        result["entry"] |= {"algo": "ppo", "hyperparameters": {"n_envs": 16}}
+        return result | {"defaults": {"n_steps": 8_192}}
+
+    scores = {agent: {"Pong": SCORES[agent]["Pong"]} for agent in ("dqn", FULL)}
+    notes = compare([a_benchmark(tmp_path / "a", scores, a_suite(games=["Pong"]), change)], {}, False).notes
+    assert "dqn makes no update on Pong (a rollout has 131,072 of 100,000 steps): it stays untrained." in notes
+
+
 def test_two_folders_make_one_benchmark(tmp_path):
     first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]})
     second = a_benchmark(tmp_path / "b", {FULL: SCORES[FULL]})

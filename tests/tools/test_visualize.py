@@ -291,6 +291,9 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
     assert isinstance(found, VecNormalize) and found.obs_rms.mean[0] == 7 and not found.training and not found.norm_reward
     seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
     assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
+    assert found.get_attr("render_mode") == [None]
+    (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", env_kwargs={"render_mode": "rgb_array"})))
+    assert loading.make_env(loaded, path).get_attr("render_mode") == ["rgb_array"]  # of a file of entries, or after --resume
     other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
     assert other.num_envs == 2
 
@@ -309,6 +312,12 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
         ),
         ("config.yml", "env_wrapper: gymnasium.wrappers.RecordVideo", "write no files, got .*RecordVideo"),
         ("config.yml", "normalize: dict(norm_obs=print())", "got dict"),
+        # Functions and classes that the modules of wrappers import, which chained could import any module and write files.
+        ("config.yml", "env_wrapper: [{gymnasium.wrappers.rendering.cast: {val: [this]}}]", r"got gymnasium.*\.cast"),
+        ("config.yml", "env_wrapper: [sb3_eqr.envs.import_packages]", r"got sb3_eqr\.envs\.import_packages"),
+        ("config.yml", "env_wrapper: [{sb3_eqr.envs.atari.make_vec_env: {monitor_dir: x}}]", r"got .*\.make_vec_env"),
+        ("config.yml", "vec_env_wrapper: stable_baselines3.common.vec_env.vec_monitor.ResultsWriter", r"got .*ResultsWriter"),
+        ("config.yml", "env_wrapper: gymnasium.wrappers.nothing.Wrapper", r"got gymnasium\.wrappers\.nothing\.Wrapper"),
         ("vecnormalize.pkl", pickle.dumps(functools.partial(print)), r"it names functools\.partial"),
     ],
 )

@@ -19,11 +19,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
+from sb3_eqr.common.checkpoints import find_checkpoints
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
-from sb3_eqr.zoo.resuming import RngPreserving
+from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
 from tests.toys import ChainEnv, ImageEnv
 
 
@@ -260,6 +261,29 @@ def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
     assert (model.n_envs, model.gradient_steps, model.gamma) == (2, 1, 0.9) and model.num_timesteps >= 400
     settings = read_plain(resumed / "CartPole-v1" / "config.yml")
     assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
+
+
+def test_a_resumed_run_is_evaluated_in_its_own_environment(sb3_eqr, capfd, tmp_path, monkeypatch):
+    """Also if the command does not repeat --env-kwargs; and the message says how many steps are needed."""
+    line = f"train --algo eqr_qrdqn --env FrozenLake-v1 --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
+    sb3_eqr(f"{line} -n 200 --checkpoint-every 100 --env-kwargs is_slippery:False -params learning_starts:20 train_freq:4")
+    made, create_envs = [], ResumableExperiment.create_envs
+
+    def watched(self, *args, **kwargs):
+        made.append(self.eval_env_kwargs if kwargs.get("eval_env") else self.env_kwargs)
+        return create_envs(self, *args, **kwargs)
+
+    monkeypatch.setattr(ResumableExperiment, "create_envs", watched)
+    run = tmp_path / "eqr_qrdqn" / "FrozenLake-v1_1"
+    sb3_eqr(f"{line} -n 240 --resume {run}")
+    assert made == [{"is_slippery": False}] * 2
+    step = int(find_checkpoints(run / "checkpoints")[-1].name.removeprefix("checkpoint-"))
+    with pytest.raises(SystemExit):
+        sb3_eqr(f"{line} -n 50 --resume {run}")
+    assert f"is already at step {step}. Pass -n above {step}." in capfd.readouterr().err
+    (run / "FrozenLake-v1" / "args.yml").unlink()
+    with pytest.raises(ValueError, match=r"must have args\.yml beside config\.yml"):
+        config_of(run, trust=True)
 
 
 class Drawing(BaseCallback):
