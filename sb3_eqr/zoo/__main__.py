@@ -17,6 +17,7 @@ from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail, nearest
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
+from sb3_eqr.zoo.registration import trust_files
 
 # The functions and modules of rl_zoo3 behind each command.
 FUNCTIONS = {
@@ -250,6 +251,8 @@ def explanation(command: str, error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         return f"{command}: {error}.{advice}"
+    if "pass trust=True" in str(error):
+        return f"{command}: {error}"
     if isinstance(error, gym.error.DependencyNotInstalled):
         return str(error)
     if "observation space is not supported" in str(error):
@@ -277,12 +280,15 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
         path = prepare_training(args)
         prepare_resuming(args)
         arguments = without_resuming(arguments)
-        return arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
-    if command in LOADING and args.algo is not None:
+        arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
+    elif command in LOADING and args.algo is not None:
         check_device(args.device)
         downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
         if not downloads:
             check_trained(args)
+        arguments = without_resuming(arguments)
+    if args.trust and args.algo in AGENTS:
+        trust_files(args.algo)
     return arguments
 
 

@@ -34,7 +34,7 @@ def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
 
 def fail(message: str) -> NoReturn:
     """Print an error without a traceback, and exit with status 2 as argparse does."""
-    print(f"sb3-eqr: {message}", file=sys.stderr)
+    print(f"sb3-eqr: {message.replace('pass trust=True', 'pass --trust')}", file=sys.stderr)
     raise SystemExit(2)
 
 

@@ -22,3 +22,16 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
         HYPERPARAMS_SAMPLER[name] = make_sampler(name == "eqr_rainbow", kept)
         HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
     envs.register()
+
+
+def trust_files(algo: str) -> None:
+    """Make RL Zoo, which cannot pass ``trust``, load the files of an agent with it: its own classes are then imported."""
+    kind = AGENTS[algo]
+
+    class Trusting(kind):  # type: ignore[valid-type, misc]
+        @classmethod
+        def load(cls, *args: Any, **kwargs: Any) -> Any:
+            return super().load(*args, **{**kwargs, "trust": True})
+
+    Trusting.__name__ = kind.__name__  # saved with its files
+    ALGOS[algo] = Trusting

@@ -263,6 +263,28 @@ def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
     assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
 
 
+def test_agents_with_classes_of_their_own_can_be_played(sb3_eqr, capfd, tmp_path, monkeypatch):
+    (tmp_path / "my_trunk.py").write_text(
+        "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(ALGOS, "eqr_qrdqn", EqRQRDQN)
+    own = "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_trunk').Mine)"
+    (tmp_path / "own.yml").write_text(
+        yaml.dump({"CartPole-v1": {"policy": "MlpPolicy", "policy_kwargs": own, "n_timesteps": 60}})
+    )
+    files = f"-f {tmp_path} --algo eqr_qrdqn --env CartPole-v1"
+    sb3_eqr(f"train {files} --conf-file {tmp_path}/own.yml --eval-freq -1 -params prediction_depth:0")
+    with pytest.raises(SystemExit):
+        sb3_eqr(f"enjoy {files} -n 5 --no-render")
+    assert re.search(r"my_trunk\.Mine.*If you trust the file, pass --trust", capfd.readouterr().err)
+    sb3_eqr(f"enjoy {files} -n 5 --no-render --trust")
+    saved = tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip"
+    sb3_eqr(f"train {files} --conf-file {tmp_path}/own.yml --eval-freq -1 -params prediction_depth:0 -i {saved} --trust")
+    again = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip", trust=True)
+    assert "Mine" in str(again.policy.online.features_extractor)
+
+
 def test_a_resumed_run_is_evaluated_in_its_own_environment(sb3_eqr, capfd, tmp_path, monkeypatch):
     """Also if the command does not repeat --env-kwargs; and the message says how many steps are needed."""
     line = f"train --algo eqr_qrdqn --env FrozenLake-v1 --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
