@@ -124,7 +124,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     entry = read_entry(path, args.env, args.hyperparams)
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
-    name = entry_name(read_file(path), args.env)
+    name = entry_name(read_file(path), args.env, args.hyperparams)
     if name.startswith("default-"):  # RL Zoo would use "default"
         file = temporary_folder() / f"{args.algo}.yml"
         file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")

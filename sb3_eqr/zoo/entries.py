@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import yaml
 from rl_zoo3 import exp_manager
-from rl_zoo3.utils import ALGOS
+from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_eqr.common.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
@@ -88,12 +88,14 @@ def read_file(path: str) -> dict[str, Any]:
     return entries
 
 
-def entry_name(entries: dict[str, Any], env_id: str) -> str:
+def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) -> str:
     """
     :param entries: entries of a file
     :param env_id: the environment
+    :param changes: changes of the entry, which may wrap the environment
     :return: its own name, "atari", or that of a generic entry: "default", or "default-image" or "default-small-image" if
-        the file has them and the observations are images (RL Zoo itself knows only "default")
+        the file has them and the observations are images (RL Zoo itself knows only "default"); exits with a message if the
+        environment cannot be made
     """
     if env_id in entries:
         return env_id
@@ -101,8 +103,12 @@ def entry_name(entries: dict[str, Any], env_id: str) -> str:
         return "atari"
     if not any(name.startswith("default-") for name in entries):
         return "default"
-    env = gym.make(env_id)
-    space = env.observation_space
+    try:
+        env = gym.make(env_id, **(changes.get("env_kwargs") or {}))
+        wrap = get_wrapper_class(changes) if changes.get("env_wrapper") else None
+        space = (env if wrap is None else wrap(env)).observation_space
+    except (ValueError, TypeError, ImportError, AttributeError) as error:
+        fail(f"{env_id}: {error}")
     env.close()
     if not is_image_space(space):
         return "default"
@@ -117,7 +123,7 @@ def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
     :return: the entry as in the file, with the changes; exits with a message if there is none
     """
     entries = read_file(path)
-    name = entry_name(entries, env_id)
+    name = entry_name(entries, env_id, changes)
     if name not in entries:
         fail(f"{path} has no entry for {env_id!r}, only for {', '.join(entries) or 'none'}. Add one, or use another file.")
     if not isinstance(entries[name] or {}, dict):

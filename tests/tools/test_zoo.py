@@ -24,6 +24,7 @@ from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
+from sb3_eqr.zoo.entries import entry_name
 from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
 from tests.toys import ChainEnv, ImageEnv
 
@@ -194,6 +195,18 @@ def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     folder = tmp_path / algo / f"{env_id}_1"
     model = zoo.AGENTS[algo].load(folder / f"{env_id}.zip")
     assert model._n_updates > 0 and policy in (folder / env_id / "config.yml").read_text()
+
+
+def test_wrappers_decide_which_entry_is_used(capfd):
+    entries = {name: {} for name in ("default", "default-image", "default-small-image")}
+    small = {"env_wrapper": [{"stable_baselines3.common.atari_wrappers.WarpFrame": {"width": 16, "height": 16}}]}
+    assert entry_name(entries, "SlidingBall-v0", {}) == "default-image"
+    assert entry_name(entries, "SlidingBall-v0", small) == "default-small-image"
+    flat = {"env_wrapper": "gymnasium.wrappers.FlattenObservation"}
+    assert entry_name(entries, "SlidingBall-v0", flat) == "default"
+    with pytest.raises(SystemExit):
+        entry_name(entries, "SlidingBall-v0", {"env_kwargs": {"size": 20}})
+    assert "SlidingBall-v0: size must be an integer >= 36, got 20" in capfd.readouterr().err
 
 
 def test_a_run_without_a_model_names_those_with_one(sb3_eqr, capfd, tmp_path):
