@@ -247,7 +247,7 @@ def test_train_enjoy_and_resume(sb3_eqr, tmp_path):
 
 def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
     line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 1300 --eval-freq -1 -f {tmp_path}"
-    sb3_eqr(f"{line} --seed 1 --checkpoint-every 500 -params learning_starts:100")
+    sb3_eqr(f"{line} --seed 1 --checkpoint-every 500 -params learning_starts:100 gradient_steps:16")
     whole = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
     for more, message in (
         ("--seed 2", "leave out --hyperparams, --trained-agent and --seed"),
@@ -301,7 +301,8 @@ def test_agents_with_classes_of_their_own_can_be_played(sb3_eqr, capfd, tmp_path
 def test_a_resumed_run_is_evaluated_in_its_own_environment(sb3_eqr, capfd, tmp_path, monkeypatch):
     """Also if the command does not repeat --env-kwargs; and the message says how many steps are needed."""
     line = f"train --algo eqr_qrdqn --env FrozenLake-v1 --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
-    sb3_eqr(f"{line} -n 200 --checkpoint-every 100 --env-kwargs is_slippery:False -params learning_starts:20 train_freq:4")
+    few_updates = "-params learning_starts:20 train_freq:4 gradient_steps:1"
+    sb3_eqr(f"{line} -n 200 --checkpoint-every 100 --env-kwargs is_slippery:False {few_updates}")
     made, create_envs = [], ResumableExperiment.create_envs
 
     def watched(self, *args, **kwargs):
