@@ -202,7 +202,8 @@ def table(results: list[dict[str, Any]]) -> str:
     """
     :return: a Markdown table, a row per world and arm; every column has the worst of the seeds
     """
-    rows = ["| world | arm | steps | found | circular R² | not opposite | 20 steps ahead: mean | furthest |", "|---" * 8 + "|"]
+    columns = "environment | options | steps | found | circular R² | not opposite | 20 steps ahead: mean | furthest"
+    rows = [f"| {columns} |", "|---" * 8 + "|"]
     for key in dict.fromkeys((result["world"], result["arm"], result["steps"]) for result in results):
         runs = [result for result in results if (result["world"], result["arm"], result["steps"]) == key]
         worst = {name: max(np.max(run[name]) for run in runs) for name in ("not_opposite", "ahead_mean", "ahead_max")}
