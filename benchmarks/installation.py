@@ -35,10 +35,13 @@ COMMANDS = (
     Command("sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render", "-n 200"),
     Command("sb3-eqr train --algo eqr_qrdqn --env FrozenLake-v1 -n 20000", "-n 2000 --eval-freq -1"),
     Command("sb3-eqr visualize cartpole.zip --env CartPole-v1 --video"),
-    Command("sb3-eqr benchmark run results/first --suite smoke --agents eqr_qrdqn qrdqn:stock --seeds 2", "--steps 500"),
+    Command(
+        "sb3-eqr benchmark run results/first --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2",
+        "--steps 500",
+    ),
     Command("sb3-eqr benchmark report results/first"),
     Command(
-        "sb3-eqr benchmark run results/mine --suite minatar --agents eqr_qrdqn eqr_rainbow qrdqn:stock --seeds 5",
+        "sb3-eqr benchmark run results/mine --suite minatar --agents eqr_rainbow eqr_rainbow:off qrdqn:stock --seeds 5",
         "--games Breakout --steps 300 --seeds 1",
     ),
     Command("sb3-eqr benchmark report results/mine", "--force"),

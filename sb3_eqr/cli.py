@@ -3,12 +3,17 @@
 import importlib
 import sys
 
+from sb3_eqr import __version__
+
 # Commands of this package rather than RL Zoo; each has the name of the extra that it needs.
 COMMANDS = ("benchmark", "visualize")
 
 
 def main() -> None:
     """Run the command, or print what to install for it."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"sb3_eqr {__version__}")
+        return
     extra = sys.argv[1] if sys.argv[1:2] and sys.argv[1] in COMMANDS else "zoo"
     try:
         if extra in COMMANDS:

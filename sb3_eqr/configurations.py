@@ -57,7 +57,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
             f"configuration {name!r}, {env_id!r}: policy_kwargs must be a dictionary, got Python code, which only RL Zoo "
             f"evaluates. Use sb3-eqr train --conf-file {name}, or pass the arguments to the constructor yourself."
         )
-    return with_schedule(_merged(arguments, changes))
+    return with_schedule(merged(arguments, changes))
 
 
 def with_schedule(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -77,9 +77,10 @@ def with_schedule(arguments: dict[str, Any]) -> dict[str, Any]:
     return {**arguments, "learning_rate": LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)}
 
 
-def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """:return: ``old`` with the values of ``new``; nested dictionaries are merged, too"""
     result = {**old, **new}
     for key in old.keys() & new.keys():
         if isinstance(old[key], dict) and isinstance(new[key], dict):
-            result[key] = _merged(old[key], new[key])
+            result[key] = merged(old[key], new[key])
     return result

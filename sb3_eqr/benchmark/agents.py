@@ -9,11 +9,12 @@ from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
 from sb3_eqr.benchmark.suites import nearest_name
-from sb3_eqr.configurations import STOCK, configuration_files
+from sb3_eqr.configurations import STOCK, configuration_files, merged
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
 
 WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change the environment
+OFF = "off"
 CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms without support for discrete actions
 DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that support discrete actions only
 PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
@@ -25,18 +26,20 @@ class Agent(NamedTuple):
     :param name: name in tables: "qrdqn", "qrdqn:stock", "eqr_rainbow:se2+aet"
     :param algo: RL Zoo's name of the algorithm
     :param file: file of hyperparameters
+    :param changes: hyperparameters that override those of the file; dictionaries are merged
     """
 
     name: str
     algo: str
     file: pathlib.Path
+    changes: dict[str, Any] = {}
 
 
 def find_agent(text: str) -> Agent:
     """
     :param text: ALGO or ALGO:ENTRIES. ALGO alone uses RL Zoo's hyperparameters for a stock algorithm, ours for an EqR agent.
-        ENTRIES is "stock" (zoo_hyperparams/stock), the name of one of our files, an unambiguous prefix of such a name
-        ("mlp" for "mlp+aet+r"), or the path of a YAML file
+        ENTRIES is "stock" (zoo_hyperparams/stock), "off" (an EqR agent without group and auxiliary losses), the name of one
+        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file
     :raises ValueError: for an unknown algorithm or file, with the nearest name
     """
     register()
@@ -47,6 +50,8 @@ def find_agent(text: str) -> Agent:
     if not entries:
         own = files[algo] if algo in AGENTS else pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
         return Agent(algo, algo, own)
+    if entries == OFF and algo in AGENTS:
+        return Agent(text, algo, files[algo], {"prediction_depth": 0, "policy_kwargs": {"group": None}})
     if entries.endswith((".yml", ".yaml")):
         if not pathlib.Path(entries).is_file():
             raise ValueError(f"--agents: {text!r}: there is no file {entries}")
@@ -62,6 +67,7 @@ def find_agent(text: str) -> Agent:
         )
     if name not in files:
         legal += [STOCK] if f"{STOCK}/{algo}" in files else []
+        legal += [OFF] if algo in AGENTS else []
         raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
 
@@ -103,7 +109,7 @@ def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces
     """
     steps, env_id, preprocessing = protocol["steps"], protocol["env_id"], protocol["preprocessing"]
     changes = {**preprocessing, "n_timesteps": steps}
-    entry = find_entry(str(agent.file), env_id, changes)
+    entry = merged(find_entry(str(agent.file), env_id, changes), agent.changes)
     check_entry(read_entry(str(agent.file), env_id, changes), agent.algo, str(agent.file))
     where = f"{agent.name}, {env_id}"
     if own := [key for key in WORLD if entry.get(key) is not None and key not in preprocessing]:

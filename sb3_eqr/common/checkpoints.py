@@ -241,10 +241,15 @@ class ExactCheckpointCallback(BaseCallback):
         manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)
         other = [name for name in theirs if theirs[name] != ours.get(name)]
-        is_behind = self.model.seed is None and manifest.get("num_timesteps", 0) > self.model.num_timesteps
-        if other or is_behind:
-            why = f"{other[0]} = {decode(theirs[other[0]])!r} there, {decode(ours.get(other[0]))!r} here" if other else ""
-            why = why or "this run has no seed"
+        step, last = self.model.num_timesteps, manifest.get("num_timesteps", 0)
+        why = ""
+        if other:
+            why = f"{other[0]} = {decode(theirs[other[0]])!r} there, {decode(ours.get(other[0]))!r} here"
+        elif last > step == 0:  # resume would choose theirs, which has more steps
+            why = f"it is at step {last}, this run begins"
+        elif last > step and self.model.seed is None:
+            why = "this run has no seed"
+        if why:
             raise ValueError(
                 f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
                 "Pass another folder, or resume that run."

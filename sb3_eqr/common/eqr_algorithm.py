@@ -1,5 +1,6 @@
 """The algorithm: arguments, components and training loop of all EqR agents (Algorithm 1)."""
 
+import copy
 import inspect
 import io
 import pathlib
@@ -437,12 +438,20 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution."""
+        """
+        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution. After an error,
+        all parameters are as before.
+        """
         if not isinstance(load_path_or_dict, dict):
             saved = read_data(load_path_or_dict).get("policy_description", {})
             validation.check_same_parameters(self.policy_description, saved)
         self._monitor.forget()
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        before: Any = copy.deepcopy(self.get_parameters())
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        except Exception:
+            super().set_parameters(before)  # PyTorch copies the tensors that fit before it raises
+            raise
         for parameter, state in self.policy.optimizer.state.items():
             for name, value in state.items():
                 if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():

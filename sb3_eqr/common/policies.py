@@ -363,8 +363,8 @@ class EqRPolicy(BasePolicy):
     def check_losses(self, aet: bool, symmetry: bool) -> None:
         """Raise ValueError if this policy does not support the requested AET or GET (``symmetry``) loss."""
         if symmetry and not self.latent_model.has_symmetry_loss:
-            remedy = "Pass symmetry_coef=0" + (" or another group." if self.transition == "group" else ".")
-            raise ValueError(f"group must have inverses for the GET loss, got {self.group!r}. {remedy}")
+            others = ", another group, or prediction_depth=0 for an agent without EqR" if self.transition == "group" else ""
+            raise ValueError(f"group must have inverses for the GET loss, got {self.group!r}. Pass symmetry_coef=0{others}.")
         if aet and self.projection == "head" and isinstance(self.latent_model.embedding, GroupLayer):
             raise ValueError(
                 'projection must be "own" or "none" if head_input="trunk", because the Q head then takes no group elements, '

@@ -28,8 +28,10 @@ PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
     "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show: "
     "docs/faq.md.",
-    "does not predict": "The latent model does not predict: {errors}. Train longer. prediction_depth and aet_coef must be "
-    "above 0. If that does not help, transition.csv shows at which step it fails.",
+    "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
+    "than both. Train longer, with aet_coef above 0. If that does not help, transition.csv shows at which step it fails.",
+    "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
+    "symmetry_coef and reward_coef all are.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
 }
@@ -49,7 +51,7 @@ class Diagnostics(NamedTuple):
     action_symmetry: ActionSymmetry | None  # None if the group has no inverse
     collapse: Collapse
     rewards: Rewards
-    verdict: str  # "predicts", "does not predict" or "collapsed"
+    verdict: str  # "predicts", "does not predict", "collapsed" or "not trained"
     rewards_trained: bool = True  # whether the agent's settings train its reward predictor
     symmetry_trained: bool = True  # the same for ρ
 
@@ -62,7 +64,8 @@ class Diagnostics(NamedTuple):
             f"than when standing still ({_lower(latent_skill)} and {_lower(latent_gain)} between latent states, before the "
             "projection)"
         )
-        return SENTENCES[self.verdict].format(errors=errors, unless=UNLESS if latent_gain < PREDICTS else "")
+        unless = UNLESS if latent_gain < PREDICTS else ""
+        return SENTENCES[self.verdict].format(errors=errors, unless=unless, limit=PREDICTS)
 
 
 def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
@@ -97,25 +100,29 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
         action_symmetry=find_action_symmetry(model, data, np.random.default_rng(seed)),
         collapse=find_collapse(model, data.states, play.samples.observations),
         rewards=measures.reward_error(data.predicted_rewards, data.rewards.sign() if signed else data.rewards, data.mask),
-        verdict=find_verdict(loss),
+        verdict=find_verdict(loss, is_trained=model.depth > 0),
         rewards_trained=model.depth > 0 and model.reward_coef > 0,
         symmetry_trained=model.depth > 0 and model.symmetry_coef > 0,
     )
 
 
-def find_verdict(loss: Transition) -> str:
+def find_verdict(loss: Transition, is_trained: bool = True) -> str:
     """
     - "predicts": the rollout removes at least a quarter of the error of shuffled targets, and of that of standing still.
       An untrained agent whose states differ may achieve the first, since its κ moves them little, but not the second.
+    - "not trained": otherwise, if no loss trains the latent model.
     - "collapsed": otherwise, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are
       equal, and κ does not move them. In an untrained agent the states may be nearly equal, but κ moves them.
     - "does not predict": otherwise.
 
     :param loss: errors on the unit sphere
+    :param is_trained: whether the agent's settings train its latent model
     """
     skill, gain = skill_and_gain(loss)
     if skill >= PREDICTS and gain >= PREDICTS:
         return "predicts"
+    if not is_trained:
+        return "not trained"
     return "collapsed" if _mean(loss.shuffled, loss.n_windows) < COLLAPSED else "does not predict"
 
 

@@ -155,8 +155,8 @@ def without_resuming(arguments: list[str]) -> list[str]:
     return parser.parse_known_args(arguments)[1]
 
 
-def prepare_resuming(args: argparse.Namespace) -> None:
-    """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and make RL Zoo apply them."""
+def prepare_resuming(args: argparse.Namespace) -> list[str]:
+    """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and make RL Zoo apply them. Returns arguments to add."""
     from sb3_eqr.zoo import resuming
 
     is_asked = args.checkpoint_every is not None or args.resume is not None
@@ -166,14 +166,17 @@ def prepare_resuming(args: argparse.Namespace) -> None:
         fail(f"--checkpoint-every must be >= 1 step, got {args.checkpoint_every}.")
     if args.optimize_hyperparameters and is_asked:
         fail("--checkpoint-every and --resume are for single runs, got a search (-optimize).")
+    seed = None
     if args.resume is not None:
         if args.hyperparams or args.trained_agent or args.seed != -1:
             fail("--resume uses the settings and seed of the run: leave out --hyperparams, --trained-agent and --seed.")
         try:
-            read_manifest(resuming.checkpoints_of(args.resume))
+            _, manifest = read_manifest(resuming.checkpoints_of(args.resume))
         except ValueError as error:
             fail(f"--resume: {error}")
+        seed = manifest["settings"].get("seed")
     resuming.install(args.checkpoint_every, args.resume, args.trust)
+    return [] if seed is None else ["--seed", str(seed)]  # RL Zoo shows and stores it, and would draw one
 
 
 def check_runs(arguments: list[str]) -> None:
@@ -278,8 +281,7 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
         check_algo(args.algo)
     if command == "train":
         path = prepare_training(args)
-        prepare_resuming(args)
-        arguments = without_resuming(arguments)
+        arguments = [*without_resuming(arguments), *prepare_resuming(args)]
         arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
     elif command in LOADING and args.algo is not None:
         check_device(args.device)

@@ -1,6 +1,7 @@
 """Resumable runs of ``sb3-eqr train``: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
 
 import pathlib
+import shutil
 from collections.abc import Sequence
 from functools import partial
 from types import SimpleNamespace
@@ -45,6 +46,7 @@ class ResumableExperiment(ExperimentManager):
         try:
             return super().setup_experiment()
         except (ValueError, TypeError, IndexError, ImportError) as error:
+            shutil.rmtree(self.save_path, ignore_errors=True)  # made for this run; enjoy would look for its model there
             fail(f"{self.algo} on {self.env_name.gym_id}, by {self.config}: {error}")
 
     def create_callbacks(self) -> None:

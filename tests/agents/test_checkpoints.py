@@ -180,7 +180,6 @@ def test_different_runs_cannot_share_a_folder(checkpoint):
     with pytest.raises(ValueError, match=r"observation_space = 'Box.*\(3,\), float32\)' there"):
         EqRQRDQN("MlpPolicy", "Acrobot-v1", **SMALL).learn(60, ExactCheckpointCallback(20, folder))
     assert sorted(folder.iterdir()) == before
-    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(30, ExactCheckpointCallback(20, folder))  # the same run once more
 
 
 class OtherEnv(ChainEnv):
@@ -199,14 +198,19 @@ def test_a_checkpoint_is_never_discarded_when_it_is_written(checkpoint):
         assert [int(path.name.removeprefix("checkpoint-")) for path in find_checkpoints(checkpoint.parent)] == left
 
 
-def test_a_run_without_a_seed_cannot_restart_in_its_folder(tmp_path):
-    for is_first in (True, False):
-        model = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, "seed": None})
-        if is_first:
-            model.learn(60, ExactCheckpointCallback(20, tmp_path))
-        else:
-            with pytest.raises(ValueError, match="this run has no seed"):
-                model.learn(60, ExactCheckpointCallback(20, tmp_path))
+@pytest.mark.parametrize("seed", [0, None])
+def test_a_run_cannot_restart_in_its_folder(seed, tmp_path):
+    """``resume`` would choose the checkpoint with most steps, which the first run wrote."""
+    first, second = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, "seed": seed}) for _ in range(2))
+    first.learn(60, ExactCheckpointCallback(20, tmp_path))
+    step = int(find_checkpoints(tmp_path)[-1].name.removeprefix("checkpoint-"))
+    with pytest.raises(ValueError, match=f"it is at step {step}, this run begins.*Pass another folder, or resume that run"):
+        second.learn(60, ExactCheckpointCallback(20, tmp_path))
+    second.learn(25)
+    if seed is None:
+        with pytest.raises(ValueError, match="this run has no seed"):
+            second.learn(20, ExactCheckpointCallback(20, tmp_path), reset_num_timesteps=False)
+    assert int(find_checkpoints(tmp_path)[-1].name.removeprefix("checkpoint-")) == step
 
 
 def test_the_environment_must_be_built_in_the_same_way(checkpoint):

@@ -162,6 +162,14 @@ def test_set_parameters(make, tmp_path):
         other.set_parameters({"policy": parameters["policy"]})
 
 
+def test_set_parameters_that_fails_changes_nothing(make):
+    model, other = make(ChainEnv()).learn(46), make(ChainEnv(), seed=1, policy_kwargs={"latent_hidden_dim": 24})
+    before = deepcopy(other.policy.state_dict())
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        other.set_parameters(model.get_parameters())
+    assert equal_states(before, other.policy.state_dict())
+
+
 @EITHER
 def test_the_optimisers_averages_get_the_memory_layout_of_their_parameters(make):
     """PyTorch's fused Adam reads both in the order of memory."""

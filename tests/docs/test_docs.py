@@ -47,7 +47,7 @@ STEPS, LEARNING_STARTS, TRAIN_FREQ, GRADIENT_STEPS, ROLLOUT, GAME_STEPS = 20, 16
 
 
 SHELL = ("git", "cd", ".")
-CPU_BUILD = ("torch", "--index-url", "https://download.pytorch.org/whl/cpu")  # of install.md
+CPU_BUILD = ("torch==2.13.0", "--index-url", "https://download.pytorch.org/whl/cpu")  # of install.md
 
 
 def name_of(page):

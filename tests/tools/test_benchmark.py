@@ -9,16 +9,19 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from filelock import FileLock
+from gymnasium import spaces
 from ray.cluster_utils import Cluster
 from ray.exceptions import RayError
 from rich.console import Console
+from rl_zoo3.utils import ALGOS
 
 from sb3_eqr import benchmark, cli
 from sb3_eqr.benchmark import dispatch
-from sb3_eqr.benchmark.agents import find_agent
+from sb3_eqr.benchmark.agents import find_agent, hyperparameters
 from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
+from sb3_eqr.configurations import ZOO_KEYS, with_schedule
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
 
 FAST = (
@@ -370,6 +373,26 @@ def test_agents_and_their_files():
     assert find_agent("eqr_rainbow").file.parent.name == "zoo_hyperparams"
     assert find_agent("eqr_rainbow:se2+aet").file.name == "se2+aet.yml"  # and not se2+aet+r
     assert find_agent("eqr_rainbow:mlp").name == "eqr_rainbow:mlp+aet+r"
+
+
+@pytest.mark.parametrize("off, same", [("eqr_qrdqn:off", "eqr_qrdqn:qrdqn"), ("eqr_rainbow:off", "eqr_rainbow:rainbow")])
+def test_agents_without_eqr_have_the_rest_of_their_entry(off, same):
+    """On MinAtar, these are the agents of two files of ablations, which are written by hand."""
+    suite = load_suite("minatar")
+    for game in suite.games:
+        first, second = (hyperparameters(find_agent(name), suite.protocol(game), spaces.Discrete(6)) for name in (off, same))
+        assert first == {**first, **second}
+        assert first.keys() - second.keys() <= {"aet_coef", "symmetry_coef", "reward_coef", "aux_gradient_share"}
+
+
+@pytest.mark.parametrize("algo", ["eqr_qrdqn", "eqr_rainbow"])
+def test_an_entry_without_eqr_builds_its_agent(algo):
+    """CartPole's have a Q head on the group elements and a projection by the Q head."""
+    protocol = load_suite("smoke").protocol("CartPole-v1")
+    entry = hyperparameters(find_agent(f"{algo}:off"), protocol, spaces.Discrete(2))
+    arguments = with_schedule({key: value for key, value in entry.items() if key not in ZOO_KEYS})
+    model = ALGOS[algo](entry["policy"], "CartPole-v1", **arguments)
+    assert model.depth == 0 and model.policy.group is None and model.gamma == entry["gamma"]
 
 
 def test_scores_without_runs(tmp_path):

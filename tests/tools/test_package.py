@@ -96,6 +96,12 @@ def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen)
     assert lines[0] == "False" and lines[-1] == (chosen or "PASSIVE") and "usage" in found.stdout
 
 
+def test_the_cpu_build_has_the_tested_version():
+    """Otherwise ``pip install -c constraints.txt`` replaces it by the build with CUDA."""
+    (version,) = re.findall(r"^torch==(.+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.M)
+    assert f"pip install torch=={version} --index-url" in (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+
+
 def test_the_commands_of_the_installation_script_are_those_of_the_pages():
     pages = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in installation.PAGES)
     lines = [re.sub(r"\s+", " ", line.strip()) for line in pages.replace("\\\n", " ").splitlines()]

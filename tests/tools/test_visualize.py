@@ -195,7 +195,12 @@ def test_every_group(group):
 def test_dict_observations_and_an_agent_without_latent_losses():
     model = make_model(EqRRainbow, "MultiInputPolicy", Ring(keys=True), prediction_depth=0)
     found = look(model, n_steps=60, keys=True)
-    assert found.verdict == "does not predict" and not found.rewards_trained and not found.symmetry_trained
+    assert (
+        found.verdict == "not trained"
+        and "prediction_depth is 0" in found.summary
+        and not found.rewards_trained
+        and not found.symmetry_trained
+    )
 
 
 @pytest.mark.parametrize("off", ["reward", "symmetry"])

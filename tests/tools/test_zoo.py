@@ -257,12 +257,13 @@ def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, capfd, tmp_path):
             sb3_eqr(f"{line} {more} --resume {whole}")
         assert message in capfd.readouterr().err
     shown = sb3_eqr(f"{line} --resume {whole}/checkpoints/checkpoint-000000000512")
-    assert "Resuming at step 512" in shown
+    assert "Resuming at step 512" in shown and "Seed: 1\n" in shown
     resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_3"  # the second run raised, because it had no steps left
     first, second = (EqRQRDQN.load(folder / "CartPole-v1.zip") for folder in (whole, resumed))
     assert first.num_timesteps == second.num_timesteps == 1408  # a round of 128 steps
     for name, parameter in first.policy.state_dict().items():
         assert th.equal(parameter, second.policy.state_dict()[name]), name
+    assert [read_plain(run / "CartPole-v1" / "args.yml")["seed"] for run in (whole, resumed)] == [1, 1]
 
 
 def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):

@@ -149,7 +149,7 @@ class ImageExtractor(BaseFeaturesExtractor):
                 f"Images must be (channels, height, width) with at least {smallest}x{smallest} pixels, got "
                 f"{observation_space.shape}. "
                 "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])), "
-                "and shift_pixels=0: docs/own_environment.md."
+                "and shift_pixels=0, intensity_scale=0.0: docs/own_environment.md."
             )
         trunk = make_trunk(channels)
         with th.no_grad():
