@@ -20,9 +20,11 @@ def make_parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command resumes where it stopped")
     run.add_argument("folder", type=absolute, help="output folder")
     run.set_defaults(default_seeds=SEEDS)  # apart from --seeds, which shows whether it was given
-    run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, or one from --suite-file")
+    run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, smoke-atari, or one from --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
-    run.add_argument("--agents", nargs="+", help="ALGO or ALGO:ENTRIES, such as qrdqn, qrdqn:stock, eqr_rainbow:se2+aet")
+    run.add_argument(
+        "--agents", nargs="+", help="such as eqr_qrdqn, eqr_qrdqn:off (without EqR), qrdqn:stock, eqr_rainbow:se2+aet"
+    )
     run.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")
     run.add_argument("--games", nargs="+", help="a subset of the suite's games (default: all)")
     run.add_argument("--seeds", type=int, help=f"number of seeds, counted from 0 (default: {SEEDS})")
@@ -32,12 +34,24 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs and PyTorch threads per run (default: 1)")
     run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs per run, such as 0.1 (default: 0)")
     run.add_argument("--save-models", action="store_true", help="save each trained agent in models/ of its run, for enjoy -f")
-    run.add_argument("--checkpoint-every", type=float, default=300.0, metavar="SECONDS", help="default: 300 seconds")
+    run.add_argument(
+        "--checkpoint-every",
+        type=float,
+        default=300.0,
+        metavar="SECONDS",
+        help="time between checkpoints of a run (default: 300)",
+    )
     status = commands.add_parser("status", help="progress of a benchmark")
     status.add_argument("folder", type=pathlib.Path)
     report = commands.add_parser("report", help="write scores, tables, figures and report.html")
     report.add_argument("folders", nargs="+", type=pathlib.Path, metavar="folder", help="folder of a benchmark, or several")
-    report.add_argument("--reference", action="append", default=[], metavar="NAME=FILE", help="JSON: game -> scores of runs")
+    report.add_argument(
+        "--reference",
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="scores of your own: a JSON file, game -> scores of runs",
+    )
     report.add_argument("--agents", nargs="+", default=[], help="a subset of the agents (default: all)")
     report.add_argument("--baseline", help="the agent that the others are compared with (default: the first stock one)")
     report.add_argument(

@@ -50,7 +50,7 @@ USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
 All commands except the last two take RL Zoo's arguments: sb3-eqr train --help
 {RESUMING}benchmark compares agents over games and seeds: sb3-eqr benchmark --help
 visualize shows what a saved agent has learned: sb3-eqr visualize --help
-push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothing."""
+push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothing. sb3-eqr --version prints the version."""
 
 
 def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
