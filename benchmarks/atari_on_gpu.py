@@ -24,6 +24,7 @@ from scipy.stats import ttest_ind
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
+from benchmarks.probes import trunk
 from sb3_eqr import EqRRainbow
 from sb3_eqr.common.files import atomic_write
 from sb3_eqr.envs import make_atari100k_env
@@ -75,6 +76,9 @@ def train(job: argparse.Namespace, settings: str, seed: int, rows: Any) -> None:
     device = th.cuda.get_device_name() if job.device == "cuda" else "cpu"
     row = {"game": job.game, "settings": settings, "seed": seed, "device": device, "torch": th.__version__}
     model.learn(job.steps, Report(row, rows, job.rows.parent / "stop"))
+    if job.trunks:
+        job.trunks.mkdir(parents=True, exist_ok=True)
+        th.save(trunk(model).state_dict(), job.trunks / f"{settings}_{seed}.pt")
 
 
 def key_of(row: dict[str, Any]) -> tuple[str, str, int]:
@@ -134,6 +138,7 @@ def main() -> None:
     parser.add_argument("--settings", nargs="+", default=["defaults"], help="files of benchmarks/settings/atari100k")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="default: 0")
     parser.add_argument("--steps", type=int, default=100_000, help="default: %(default)s")
+    parser.add_argument("--trunks", type=pathlib.Path, help="save the trunk of each agent here, for benchmarks.probes")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--table", action="store_true", help="print the table of a file of rows, run nothing")
     job = parser.parse_args()

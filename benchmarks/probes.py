@@ -7,11 +7,13 @@ from MinAtar's planes, for Atari from the console's memory, and from the environ
     python -m benchmarks.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
     python -m benchmarks.probes --game ALE/Pong --steps 0
     python -m benchmarks.probes --game torus_of_4 --steps 0
+    python -m benchmarks.probes --game ALE/Breakout --trunks runs/trunks/*.pt
     python -m benchmarks.probes --game ALE/Boxing --models runs/atari/runs/*/Boxing/0/models/*/*/*.zip
 """
 
 import argparse
 import json
+import pathlib
 from typing import Any
 
 import gymnasium as gym
@@ -72,7 +74,10 @@ Frames = tuple[np.ndarray, dict[str, np.ndarray]]  # observations, and object ->
 
 
 def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
-    """Frames of the agent's own episodes, with about a third of its actions random; (N, *obs_shape) and (N,)."""
+    """
+    Frames of the agent's own episodes, with about a third of its actions random; (N, *obs_shape) and (N,), with NaN where a
+    ball is not in play.
+    """
     obs, frames, memory = env.reset(), [], []
     for _ in range(N_FRAMES):
         frames.append(obs[0].copy())
@@ -85,16 +90,23 @@ def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
     order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
     if game in MEMORY:
         known = {name: np.stack(memory)[:, address].astype(float) for name, address in MEMORY[game].items()}
+        if "ball: y" in known:  # 0 while no ball is in play, and x is then the last one or that of no ball
+            is_out = known["ball: y"] == 0
+            known |= {name: np.where(is_out, np.nan, known[name]) for name in ("ball: x", "ball: y")}
     else:
         known = targets(seen, PLANES[game])
     return seen[order], {name: positions[order] for name, positions in known.items()}
 
 
+def trunk(model: Any) -> Any:
+    """The trunk of an agent's encoder, with or without a group layer on top of it."""
+    encoder = model.policy.online.features_extractor
+    return encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder
+
+
 def trunk_features(model: Any, observations: th.Tensor) -> th.Tensor:
     """:return: (N, F), what the trunk and its layer norm make of observations, without a group layer on top of them"""
-    network = model.policy.online
-    encoder = network.features_extractor
-    return network.extract_features(observations, encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder)
+    return model.policy.online.extract_features(observations, trunk(model))
 
 
 def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
@@ -149,6 +161,18 @@ def probe_saved(game: str, paths: list[str]) -> None:
     print_table("R²", {name: probe(model, frames) for name, model in models.items()})
 
 
+def probe_trunks(game: str, paths: list[str]) -> None:
+    """Probe saved trunks (``benchmarks.atari_on_gpu --trunks``) and an untrained one, on frames of an untrained agent."""
+    env: Any = envs.make_atari100k_env(game.removeprefix("ALE/"), n_envs=1, seed=0)
+    model = EqRRainbow("CnnPolicy", env, seed=0, device="cpu", buffer_size=100)
+    frames = watch(model, model.get_env(), game, np.random.default_rng(0))
+    found = {"untrained": probe(model, frames)}
+    for path in paths:
+        trunk(model).load_state_dict(th.load(path, "cpu", weights_only=True))
+        found[pathlib.Path(path).stem] = {"trunk": probe(model, frames)["trunk"]}
+    print_table("R²", found)
+
+
 def main() -> None:
     """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -158,11 +182,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--models", nargs="+", help="saved agents for an Atari game, instead of training one")
+    parser.add_argument("--trunks", nargs="+", help="saved trunks for an Atari game, instead of training an agent")
     args = parser.parse_args()
     th.set_num_threads(1)
     envs.register()
     if args.models:
         probe_saved(args.game, args.models)
+        return
+    if args.trunks:
+        probe_trunks(args.game, args.trunks)
         return
     agent = args.agent or ("eqr_qrdqn" if args.game in WORLDS else "eqr_rainbow")
     for seed in args.seeds:

@@ -7,6 +7,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import torch as th
 
 from benchmarks import atari_on_gpu
 from benchmarks.atari_on_gpu import table
@@ -105,7 +106,7 @@ def test_several_runs_write_one_file(tmp_path):
         "--device",
         "cpu",
     ]
-    command += ["--settings", "defaults", "defaults_off", "--steps", "2002"]
+    command += ["--settings", "defaults", "defaults_off", "--steps", "2002", "--trunks", str(tmp_path / "trunks")]
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -114,3 +115,6 @@ def test_several_runs_write_one_file(tmp_path):
         ("defaults", 2002, 2, 1),
         ("defaults_off", 2002, 2, 1),
     ]
+    trunks = [th.load(tmp_path / "trunks" / f"{row['settings']}_0.pt", weights_only=True) for row in rows]
+    shapes = [{name: value.shape for name, value in trunk.items()} for trunk in trunks]
+    assert shapes[0] == shapes[1]
