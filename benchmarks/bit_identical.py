@@ -132,7 +132,6 @@ CONFIGURATIONS: dict[str, Configuration] = {
             "resets": {
                 "interval": 70,
                 "shrink_factor": 0.4,
-                "end": 0.8,
                 "initial_n_steps": 6,
                 "initial_gamma": 0.9,
                 "annealing_steps": 50,

@@ -5,6 +5,7 @@ import pathlib
 from typing import Any, NamedTuple
 
 import rl_zoo3
+import yaml
 from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
@@ -39,7 +40,8 @@ def find_agent(text: str) -> Agent:
     """
     :param text: ALGO or ALGO:ENTRIES. ALGO alone uses RL Zoo's hyperparameters for a stock algorithm, ours for an EqR agent.
         ENTRIES is "stock" (zoo_hyperparams/stock), "off" (an EqR agent without group and auxiliary losses), the name of one
-        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file
+        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file: entries, or
+        ``base``, the ENTRIES or file to start from, and ``changes``
     :raises ValueError: for an unknown algorithm or file, with the nearest name
     """
     register()
@@ -55,7 +57,7 @@ def find_agent(text: str) -> Agent:
     if entries.endswith((".yml", ".yaml")):
         if not pathlib.Path(entries).is_file():
             raise ValueError(f"--agents: {text!r}: there is no file {entries}")
-        return Agent(f"{algo}:{pathlib.Path(entries).stem}", algo, pathlib.Path(entries).resolve())
+        return _agent_of_file(algo, pathlib.Path(entries).resolve())
     name = f"{STOCK}/{algo}" if entries == STOCK else entries
     legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
     longer = [key for key in legal if key.startswith(entries)]
@@ -70,6 +72,16 @@ def find_agent(text: str) -> Agent:
         legal += [OFF] if algo in AGENTS else []
         raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
     return Agent(f"{algo}:{entries}", algo, files[name])
+
+
+def _agent_of_file(algo: str, file: pathlib.Path) -> Agent:
+    """The agent of a YAML file: entries, or ``base``, which ENTRIES it starts from, and ``changes`` of all of their entries."""
+    name, found = f"{algo}:{file.stem}", yaml.safe_load(file.read_text(encoding="utf-8"))
+    if not isinstance(found, dict) or found.keys() != {"base", "changes"}:
+        return Agent(name, algo, file)
+    beside = file.parent / str(found["base"])
+    base = _agent_of_file(algo, beside) if beside.is_file() else find_agent(f"{algo}:{found['base']}")
+    return Agent(name, algo, base.file, merged(base.changes, found["changes"]))
 
 
 def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:

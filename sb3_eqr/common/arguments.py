@@ -165,7 +165,6 @@ BUFFER: dict[str, Rule] = {
 RESETS: dict[str, Rule] = {
     "interval": integer(1) | NONE,
     "shrink_factor": SHARE,
-    "end": SHARE,
     "initial_n_steps": integer(1) | NONE,
     "initial_gamma": SHARE | NONE,
     "annealing_steps": integer(1),

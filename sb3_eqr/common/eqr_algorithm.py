@@ -8,11 +8,12 @@ import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
@@ -352,7 +353,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         assert buffer is not None
         self._start_round(buffer)
         for _ in range(gradient_steps):
-            if self._resets.is_due(self._n_updates, self._current_progress_remaining):
+            if self._resets.is_due(self._n_updates, self._updates_left()):
                 self._reset()
             buffer.n_steps, buffer.gamma = self._resets.annealed(self._n_updates, self.n_steps, self.gamma)
             buffer.prediction_depth = self.depth
@@ -375,6 +376,18 @@ class EqRAlgorithm(FiniteData, SafeFiles):
                 buffer.update_priorities(samples.indices, terms.priorities)
             self._monitor.add({**terms.metrics(), "grad_norm": grad_norm})
         self._log_counts(buffer)
+
+    def _updates_left(self) -> float:
+        """How many updates will still be made in this call of ``learn``, as the expected number if rounds are episodes."""
+        frequency: Any = self.train_freq
+        if self.gradient_steps < 0:
+            per_step = 1.0
+        elif frequency.unit is TrainFrequencyUnit.STEP:
+            per_step = self.gradient_steps / (frequency.frequency * self.n_envs)
+        else:
+            lengths = [info["l"] for info in self.ep_info_buffer or []]
+            per_step = self.gradient_steps / (frequency.frequency * np.mean(lengths)) if lengths else 0.0
+        return per_step * (self._total_timesteps - self.num_timesteps)
 
     def _start_round(self, buffer: SequenceReplayBuffer) -> None:
         self._log_last_round()

@@ -410,8 +410,8 @@ class EqRPolicy(BasePolicy):
         Reset parameters to counter the loss of plasticity: reinitialise the Q head and the AET loss's own projection and
         predictor (Nikishin et al. 2022, https://arxiv.org/abs/2205.07802), and set encoder and latent model to α old +
         (1 - α) fresh (shrink and perturb, Ash and Adams 2020, https://arxiv.org/abs/1910.08475; used for the encoder in
-        SR-SPR and BBF). Batch statistics and frozen parameters are kept. The optimiser's state is cleared, and the target
-        copies the new parameters.
+        SR-SPR and BBF). Batch statistics and frozen parameters are kept; statistics of features are counted from 0 again, so
+        that the next batches replace them. The optimiser's state is cleared, and the target copies the new parameters.
 
         :param fresh: a newly initialised policy of the same kind
         :param shrink_factor: α in [0, 1]
@@ -429,6 +429,9 @@ class EqRPolicy(BasePolicy):
                 for parameter, drawn in pairs:
                     if parameter.requires_grad:
                         parameter.copy_(alpha * parameter + (1 - alpha) * drawn if alpha > 0 else drawn)
+            for module in self.modules():
+                if module.training and hasattr(module, "running_count"):
+                    module.running_count.zero_()  # not if it is frozen
         self.optimizer.state.clear()
         for copy in (self.target_copy, self.latent_target_copy):
             copy.update(1.0)

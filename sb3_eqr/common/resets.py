@@ -10,7 +10,8 @@ from sb3_eqr.common.validation import check_names
 @dataclass(frozen=True)
 class ResetSchedule:
     """
-    When an agent is reset, and how n and γ are annealed; by default neither.
+    When an agent is reset, and how n and γ are annealed; by default neither. As in BBF, there is no reset if less than a full
+    interval of training would be left after it.
 
     A reset reinitialises the Q head and the AET loss's own projection and predictor (Nikishin et al. 2022,
     https://arxiv.org/abs/2205.07802), shrinks and perturbs encoder and latent model, and clears the optimiser's state
@@ -19,8 +20,6 @@ class ResetSchedule:
 
     :param interval: gradient steps between two resets, ≥ 1; 40,000 in BBF. ``None``: no resets
     :param shrink_factor: α in [0, 1]: encoder and latent model become α old + (1 - α) fresh; 0.5 in BBF
-    :param end: fraction of training (of each call of ``learn``, as in SB3) after which there are no more resets, so that the
-        final agent has time to recover; in [0, 1]
     :param initial_n_steps: n at the start of training and after each reset, annealed geometrically to ``n_steps``, ≥ 1; 10 in
         BBF. ``None``: n is constant
     :param initial_gamma: the same for γ, annealed geometrically in 1 - γ, in [0, 1); 0.97 in BBF. ``None``: γ is constant
@@ -30,7 +29,6 @@ class ResetSchedule:
 
     interval: int | None = None
     shrink_factor: float = 0.5
-    end: float = 0.9
     initial_n_steps: int | None = None
     initial_gamma: float | None = None
     annealing_steps: int = 10_000
@@ -66,10 +64,10 @@ class Resets:
         """Number of updates since the last reset, or since the start."""
         return n_updates - (self.done[-1] if self.done else 0)
 
-    def is_due(self, n_updates: int, progress_remaining: float) -> bool:
-        """Whether a reset is due after ``n_updates`` updates; ``progress_remaining`` goes from 1 to 0."""
-        interval, over = self.schedule.interval, 1.0 - progress_remaining >= self.schedule.end
-        return interval is not None and self.updates_since(n_updates) >= interval and not over
+    def is_due(self, n_updates: int, n_left: float) -> bool:
+        """Whether a reset is due after ``n_updates`` updates, when ``n_left`` are still to come in this call of ``learn``."""
+        interval = self.schedule.interval
+        return interval is not None and self.updates_since(n_updates) >= interval and n_left >= interval
 
     def roll_back(self, n_updates: int) -> None:
         """Forget the resets made after ``n_updates`` updates."""

@@ -123,11 +123,14 @@ class Recorded(CapturedGradients):
 
 def changed_run(make, **kwargs):
     """A weight changes after 100 updates and a network is frozen after 140, both halfway between two resets."""
-    model = make(ChainEnv(), resets={"interval": 40, "end": 1.0}, tau=0.9, **kwargs).learn(90)
+    model = make(ChainEnv(), resets={"interval": 40}, tau=0.9, **kwargs).learn(50)
+    model._total_timesteps = 1_000  # as at the start of a longer run
+    model.train(100 - model._n_updates, 8)
     model.aet_coef = 0.25
-    model.learn(20, reset_num_timesteps=False)
+    model.train(40, 8)
     model.policy.freeze([model.policy.online.features_extractor])
-    return model.learn(20, reset_num_timesteps=False)
+    model.train(40, 8)
+    return model
 
 
 @EITHER

@@ -73,7 +73,6 @@ from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv
         ({"resets": {"annealing_steps": 0}}, "annealing_steps"),
         ({"resets": {"interval": 0}}, "resets: interval must be an integer >= 1"),
         ({"resets": {"shrink_factor": 1.5}}, "shrink_factor"),
-        ({"resets": {"end": -1}}, "resets: end"),
         ({"policy_kwargs": {"optimizer_class": "LBFGS"}}, "optimizer_class must not be LBFGS"),
         ({"policy_kwargs": {"optimizer_class": th.optim.SparseAdam}}, "optimizer_class must not be SparseAdam"),
         ({"replay_buffer_kwargs": {"n_envs": 7}}, "'n_envs'. Leave it out: it follows from env"),

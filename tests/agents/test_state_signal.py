@@ -235,3 +235,34 @@ def test_frames_stay_different_in_the_first_updates():
             features = model.policy.online.features(model.replay_buffer.sample(64).observations)
         spreads[center] = (features.var(dim=0, correction=0).sum().sqrt() / features.norm(dim=1).mean()).item()
     assert spreads[True] > 0.1 > 2 * spreads[False]
+
+
+@pytest.mark.parametrize("n_copies, n_averages", [(150, 50), (0, 100)])
+def test_an_averaged_target_has_centred_features(n_copies, n_averages):
+    """
+    The mean of the target's features over frames, relative to their spread, is about that of the online network. If the
+    running mean were copied and the weights averaged, it would be 4 to 6 times as large, and the actions would change.
+    """
+    settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0, "prediction_depth": 0}
+    model = EqRRainbow("CnnPolicy", make_atari100k_env("Boxing", seed=0), **settings, policy_kwargs={"group": None})
+    model.learn(200).train(n_copies, 32)
+    model.tau = 0.005
+    model.train(n_averages, 32)
+    model.policy.set_training_mode(False)
+    frames, offsets = model.replay_buffer.sample(64).observations, []
+    for network in (model.policy.online, model.policy.target):
+        with th.no_grad():
+            features = network.features(frames)
+        offsets.append((features.mean(dim=0).norm() / features.var(dim=0).sum().sqrt()).item())
+    assert offsets[1] < 1.5 * offsets[0], offsets
+
+
+def test_a_reset_starts_the_statistics_of_features_again():
+    """The first batch after it replaces the running mean, in the online network and in an averaged target."""
+    model = EqRRainbow("MlpPolicy", ChainEnv(), **SETTINGS, tau=0.005).learn(60)
+    model._reset()
+    for network in (model.policy.online, model.policy.target):
+        assert network.features_extractor.center.running_count == 0
+    model.train(1, 32)
+    means = [network.features_extractor.center.running_mean for network in (model.policy.online, model.policy.target)]
+    assert th.equal(*means) and means[0].norm() > 0

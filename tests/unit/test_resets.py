@@ -24,14 +24,14 @@ def test_without_initial_values_nothing_is_annealed():
 
 
 def test_when_a_reset_is_due():
-    resets = Resets(ResetSchedule(interval=10, end=0.75))
-    assert not resets.is_due(9, 1.0) and resets.is_due(10, 1.0) and resets.is_due(11, 0.5)
-    assert not resets.is_due(11, 0.25)  # three quarters of the training steps are done
+    resets = Resets(ResetSchedule(interval=10))
+    assert not resets.is_due(9, 90) and resets.is_due(10, 90) and resets.is_due(11, 10)
+    assert not resets.is_due(11, 9)  # less than a full interval would be left
     resets.done += [10, 25]
-    assert not resets.is_due(34, 0.9) and resets.is_due(35, 0.9)
+    assert not resets.is_due(34, 90) and resets.is_due(35, 90)
     resets.roll_back(25)
-    assert resets.done == [10] and resets.is_due(20, 0.9)
-    assert not Resets(ResetSchedule()).is_due(10**9, 1.0)
+    assert resets.done == [10] and resets.is_due(20, 90)
+    assert not Resets(ResetSchedule()).is_due(10**9, 90)
 
 
 def test_after_a_reset_annealing_starts_again():
@@ -42,7 +42,7 @@ def test_after_a_reset_annealing_starts_again():
 
 def test_a_schedule_from_a_dictionary():
     assert ResetSchedule.of(None) == ResetSchedule() == ResetSchedule.of({})
-    assert ResetSchedule.of({"interval": 5, "end": 1}) == ResetSchedule(interval=5, end=1)
+    assert ResetSchedule.of({"interval": 5, "shrink_factor": 1}) == ResetSchedule(interval=5, shrink_factor=1)
     with pytest.raises(TypeError, match=r"resets got an unexpected argument 'intervall'. Did you mean 'interval'\?"):
         ResetSchedule.of({"intervall": 5})
     with pytest.raises(TypeError, match="resets must be a ResetSchedule, a dict of its fields or None, got 40000"):

@@ -230,12 +230,14 @@ class Centering(nn.Module):
     BY_CHANCE = 3.0  # a batch that is further away than this times e has moved
 
     running_mean: th.Tensor  # (D,)
+    running_count: th.Tensor  # batches so far
     batch_mean: th.Tensor  # (D,)
     batch_error: th.Tensor  # (), e
 
     def __init__(self, n_features: int):
         super().__init__()
         self.register_buffer("running_mean", th.zeros(n_features))
+        self.register_buffer("running_count", th.zeros(()))
         self.register_buffer("batch_mean", th.zeros(n_features), persistent=False)
         self.register_buffer("batch_error", th.zeros(()), persistent=False)
 
@@ -265,6 +267,7 @@ class Centering(nn.Module):
     def update(self) -> None:
         """Called after each gradient step; without effect in eval mode."""
         if self.training:
+            self.running_count += 1
             distance = (self.batch_mean - self.running_mean).square().sum().clamp(min=1e-30)
             weight = (1 - self.BY_CHANCE * self.batch_error / distance).clamp(min=self.SMALLEST_WEIGHT)
             self.running_mean.lerp_(self.batch_mean, weight)
