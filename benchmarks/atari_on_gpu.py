@@ -26,7 +26,7 @@ from stable_baselines3.common.logger import configure
 
 from benchmarks.probes import trunk
 from sb3_eqr import EqRRainbow
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.envs import make_atari100k_env
 
 SETTINGS = pathlib.Path(__file__).parent / "settings" / "atari100k"

@@ -16,7 +16,7 @@ from typing import Any
 
 from sb3_eqr.benchmark.runs import PLAN, RESULT, write_json, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 
 PLANNED = "agent game seed suite protocol entry command".split()  # the fields of a run's plan, which its result repeats
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path

@@ -30,7 +30,7 @@ from benchmarks import workload
 from benchmarks.clock import Table, count_operations, median, take_turns
 from benchmarks.sizes import STORED, measure_sizes
 from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, bytes_per_transition, make_trainable
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others: they begin with the backup that is made every 50 updates

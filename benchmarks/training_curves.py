@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from sb3_eqr.benchmark.scores import load_results
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.plot_style import looks, styled
 
 POINTS = 50  # of a curve: means over parts of equal length

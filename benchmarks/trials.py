@@ -55,7 +55,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
     from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-    from sb3_eqr.common.latent_model import GroupLatentModel
+    from sb3_eqr.common.latent.latent_model import GroupLatentModel
     from sb3_eqr.visualize.diagnostics import diagnose
     from sb3_eqr.visualize.latents import replayed
 

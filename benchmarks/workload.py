@@ -20,7 +20,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
-from sb3_eqr.common.features_extractor import ConvExtractor
+from sb3_eqr.common.networks.encoders import ConvExtractor
 
 SIZE, N_STACK, N_ACTIONS = 84, 4, 6  # Atari's frames, Pong's actions
 BATCH_SIZE = 32  # Table 5, and SB3's default
@@ -86,7 +86,7 @@ def add_before(folder: str) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its environments override the registered ones
             package = importlib.import_module("sb3_eqr")
-            conv_extractor = importlib.import_module("sb3_eqr.common.features_extractor").ConvExtractor
+            conv_extractor = importlib.import_module("sb3_eqr.common.networks.encoders").ConvExtractor
         found = {name: (getattr(package, name), conv_extractor) for name in EQR_AGENTS}
     finally:
         sys.path.remove(path)

@@ -19,7 +19,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.envs import SlidingBall, register
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split

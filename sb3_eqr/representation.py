@@ -10,9 +10,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.groups import Group
-from sb3_eqr.common.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.latent_model import GroupLatentModel
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed

@@ -1,7 +1,7 @@
 import pytest
 import torch as th
 
-from sb3_eqr.common.update_monitor import UpdateMonitor
+from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from tests.models import MAKERS
 
 th.set_num_threads(1)  # small networks are slower on two threads, and xdist runs two tests at once

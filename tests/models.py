@@ -8,8 +8,8 @@ from torch import nn
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.latent.rollout import HiddenLayer
 from sb3_eqr.common.objective import LossCoefs
-from sb3_eqr.common.rollout import HiddenLayer
 
 SMALL = {
     "learning_starts": 40,

@@ -24,7 +24,7 @@ from benchmarks.attacks import Finding
 from benchmarks.attacks.inputs import make
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.training import load_checkpoint
-from sb3_eqr.common.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.visualize.loading import load_model, make_env
 
 RAN = pathlib.Path("ran")  # the file that hostile code creates

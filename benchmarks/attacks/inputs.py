@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.attacks import Finding
 from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
-from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, Rule
+from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, RESETS, Rule
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import load_configuration
 

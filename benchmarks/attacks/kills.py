@@ -17,7 +17,7 @@ from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.runs import RESULT, Run, Settings, plan_runs
 from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.common.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.checkpoints import find_checkpoints
 
 STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints per second
 LONGEST = 1.5  # maximum seconds before a run is killed

@@ -75,7 +75,7 @@ def find_agent(text: str) -> Agent:
 
 
 def _agent_of_file(algo: str, file: pathlib.Path) -> Agent:
-    """The agent of a YAML file: entries, or ``base``, which ENTRIES it starts from, and ``changes`` of all of their entries."""
+    """The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries."""
     name, found = f"{algo}:{file.stem}", yaml.safe_load(file.read_text(encoding="utf-8"))
     if not isinstance(found, dict) or found.keys() != {"base", "changes"}:
         return Agent(name, algo, file)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, State
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 
 ATTEMPTS = 2  # a run that crashes is retried once
 REFRESH_SECONDS = 2.0

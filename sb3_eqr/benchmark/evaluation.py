@@ -17,7 +17,7 @@ from stable_baselines3.common.env_util import is_wrapped, make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
-from sb3_eqr.common.random_state import preserved_rng_state
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation shares no episodes with training, nor with another run's evaluation
 

@@ -18,7 +18,7 @@ from sb3_eqr.benchmark.figures import all_figures, to_png
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.statistics import REPS
 from sb3_eqr.benchmark.tables import Table, game_table, make_table, number, summary_table, to_html, to_latex, to_markdown
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 
 TEMPLATE = pathlib.Path(__file__).with_name("report.html.jinja")
 

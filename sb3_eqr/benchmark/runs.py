@@ -11,8 +11,8 @@ from sb3_eqr.benchmark.agents import Agent, defaults, find_agent, hyperparameter
 from sb3_eqr.benchmark.evaluation import check_game
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
-from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.zoo import register
 
 SUITE = "suite.yml"  # in the folder of the benchmark

@@ -30,12 +30,12 @@ from sb3_eqr import envs
 from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, Run, Settings, write_json
-from sb3_eqr.common import checkpoints
-from sb3_eqr.common.checkpoints import PREFIX, find_checkpoints, write_checkpoint
-from sb3_eqr.common.files import atomic_write
-from sb3_eqr.common.plain_data import decode
 from sb3_eqr.common.resets import Resets
-from sb3_eqr.common.save_util import SafeFiles
+from sb3_eqr.common.saving import checkpoints
+from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints, write_checkpoint
+from sb3_eqr.common.saving.files import atomic_write
+from sb3_eqr.common.saving.models import SafeFiles
+from sb3_eqr.common.saving.plain_data import decode
 from sb3_eqr.zoo import register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
@@ -248,7 +248,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     """
     Like an EqR agent's ``resume``, for all agents of Stable-Baselines3.
 
-    :param checkpoint: see :func:`~sb3_eqr.common.checkpoints.write_checkpoint`
+    :param checkpoint: see :func:`~sb3_eqr.common.saving.checkpoints.write_checkpoint`
     :param model: a new agent, whose class, device and environment are used
     :return: the resumed agent, the measurements so far, and whether it resumes bit for bit; if not, with a new episode
     """

@@ -11,7 +11,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_eqr.common.gradients import assign_gradients
+from sb3_eqr.common.latent.gradients import assign_gradients
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 

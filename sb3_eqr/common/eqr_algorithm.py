@@ -17,19 +17,19 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
-from sb3_eqr.common import validation
-from sb3_eqr.common.arguments import ALGORITHM, POLICY, check, check_arguments, number
+from sb3_eqr.common.checks import validation
+from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, check, check_arguments, number
+from sb3_eqr.common.checks.finite_data import FiniteData
+from sb3_eqr.common.checks.update_monitor import BadUpdateError, UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedGradients
-from sb3_eqr.common.finite_data import FiniteData
-from sb3_eqr.common.gradients import assign_gradients, clip_grad_norm
+from sb3_eqr.common.latent.gradients import assign_gradients, clip_grad_norm
+from sb3_eqr.common.networks.optimizers import set_adam_defaults
 from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
-from sb3_eqr.common.optimizers import set_adam_defaults
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
-from sb3_eqr.common.save_util import SafeFiles, read_data
-from sb3_eqr.common.transfer import load_representation, representation
-from sb3_eqr.common.update_monitor import BadUpdateError, UpdateMonitor
+from sb3_eqr.common.saving.models import SafeFiles, read_data
+from sb3_eqr.common.saving.transfer import load_representation, representation
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 

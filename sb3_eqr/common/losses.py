@@ -1,10 +1,22 @@
-"""Losses as pure functions. Each returns one number per sample, so that replay weights can multiply it."""
+"""Losses and rescaling as pure functions. Each loss is one number per sample, so that replay weights can multiply it."""
 
 from typing import Any
 
 import torch as th
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
+
+
+def rescaled(features: th.Tensor) -> th.Tensor:
+    """
+    Shift and scale the features of each sample to [0, 1] (Schrittwieser et al. 2020,
+    https://arxiv.org/abs/1911.08265; SPR and BBF do this with the output of their convolutions).
+
+    :param features: (B, D)
+    :return: (B, D)
+    """
+    low = features.amin(dim=1, keepdim=True)
+    return (features - low) / (features.amax(dim=1, keepdim=True) - low + 1e-5)
 
 
 def normalized_distance(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:

@@ -12,7 +12,7 @@ from stable_baselines3.common.preprocessing import is_image_space, preprocess_ob
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
-from sb3_eqr.common.gradients import branch
+from sb3_eqr.common.latent.gradients import branch
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.type_aliases import LatentLosses, PyTorchObs, SequenceReplayBufferSamples
 

@@ -11,10 +11,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_eqr.common.arguments import ALGORITHM, POLICY, check_arguments
-from sb3_eqr.common.conv_latent_model import ConvLatentModel
+from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, check_arguments
+from sb3_eqr.common.checks.validation import check_names
 from sb3_eqr.common.groups import Group, NoGroup
-from sb3_eqr.common.latent_model import GroupLatentModel, LatentModel, Projection, frozen_copy
+from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
+from sb3_eqr.common.latent.latent_model import GroupLatentModel, LatentModel, Projection, frozen_copy
 from sb3_eqr.common.networks.encoders import (
     DEFAULT_GROUP,
     ConvTrunk,
@@ -28,11 +29,10 @@ from sb3_eqr.common.networks.encoders import (
     make_trunk,
 )
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead, Whitening
+from sb3_eqr.common.networks.optimizers import decay_matrices_only, find_optimizer
 from sb3_eqr.common.networks.q_networks import EqRNetwork
-from sb3_eqr.common.optimizers import decay_matrices_only, find_optimizer
-from sb3_eqr.common.target_copy import TargetCopy
+from sb3_eqr.common.networks.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.common.validation import check_names
 
 Network = TypeVar("Network", bound="EqRNetwork")
 
@@ -82,7 +82,7 @@ class EqRPolicy(BasePolicy):
     :param noisy: whether to use factorised noisy layers in the head
     :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243); Table 5 uses 0.5
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
-        (:class:`~sb3_eqr.common.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
+        (:class:`~sb3_eqr.common.latent.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
         and ``layer_norm=False``, since it predicts values in [0, 1]
     :param latent_hidden_dim: width of the hidden layers of κ, r_ψ and ρ, and of ``projection="own"``
     :param latent_norm: norm of these layers: "layer", or "batch" (appendix B.4), with which an unusual state in a batch

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
-from sb3_eqr.common.arguments import RESETS, check_arguments
-from sb3_eqr.common.validation import check_names
+from sb3_eqr.common.checks.arguments import RESETS, check_arguments
+from sb3_eqr.common.checks.validation import check_names
 
 
 @dataclass(frozen=True)

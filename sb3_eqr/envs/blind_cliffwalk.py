@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 
 
 class BlindCliffwalk(gym.Env):

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.arguments import check, integer, number
+from sb3_eqr.common.checks.arguments import check, integer, number
 from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, enlarge
 
 # The constants of gymnasium's Pendulum-v1; mass and length are 1.

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 
 SMALLEST_PICTURE = 36  # smallest image that the default convolutions of CnnPolicy accept
 ENLARGED = 4  # scale factor from an observation to a rendered image

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, check_position, enlarge
 
 TURN = pi / 16  # rad, about 0.2; 32 turns make a full one

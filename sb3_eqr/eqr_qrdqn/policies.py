@@ -8,7 +8,7 @@ from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_eqr.common.arguments import POLICY, check_arguments
+from sb3_eqr.common.checks.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import quantile_huber_loss
 from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork

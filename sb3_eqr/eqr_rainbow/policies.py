@@ -8,7 +8,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
-from sb3_eqr.common.arguments import POLICY, check_arguments
+from sb3_eqr.common.checks.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import categorical_loss, categorical_projection
 from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork

@@ -12,11 +12,11 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_eqr.common.arguments import check, integer, number
+from sb3_eqr.common.checks.arguments import check, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.files import atomic_write
 from sb3_eqr.common.groups import NoGroup
-from sb3_eqr.common.random_state import preserved_rng_state
+from sb3_eqr.common.saving.files import atomic_write
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize.canvas import Line, Painter
 from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode, group_model

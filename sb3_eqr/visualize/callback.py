@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
 from sb3_eqr.visualize.latent_figure import latent_figure

@@ -14,12 +14,12 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_eqr.common.arguments import check, integer
+from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
-from sb3_eqr.common.latent_model import GroupLatentModel
-from sb3_eqr.common.random_state import preserved_rng_state
+from sb3_eqr.common.latent.latent_model import GroupLatentModel
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
 CHUNK = 256  # observations encoded at once

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 import sb3_eqr.envs
 from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.save_util import is_whole_model
+from sb3_eqr.common.saving.models import is_whole_model
 from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.visualize.latents import FACTOR_KEYS
 

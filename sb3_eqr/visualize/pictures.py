@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, styled
 from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
 from sb3_eqr.visualize.latent_figure import MAX_PANELS, SIZE, latent_figure, make_axes, n_columns

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from sb3_eqr.common.files import atomic_write
+from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.visualize.diagnostics import Diagnostics, skill_and_gain
 from sb3_eqr.visualize.findings import ActionSymmetry
 from sb3_eqr.visualize.measures import mean_of_known

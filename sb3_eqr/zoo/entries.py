@@ -13,7 +13,7 @@ from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_eqr.common.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
+from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files

@@ -10,7 +10,7 @@ import huggingface_hub
 import huggingface_sb3
 import requests
 
-from sb3_eqr.common.files import temporary_folder
+from sb3_eqr.common.saving.files import temporary_folder
 
 DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {

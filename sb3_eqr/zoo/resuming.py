@@ -14,8 +14,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_eqr.common.checkpoints import ExactCheckpointCallback
-from sb3_eqr.common.random_state import preserved_rng_state
+from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.trust import check_zoo_folder, read_plain
 from sb3_eqr.zoo.checks import fail
 

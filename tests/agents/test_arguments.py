@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
-from sb3_eqr.common.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
+from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.eqr_qrdqn import EqRQRDQNPolicy
@@ -18,7 +18,7 @@ from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
 
 NOT_IN_A_TABLE = {
-    # the algorithm: checked by SB3 or by sb3_eqr.common.validation, which know the context
+    # the algorithm: checked by SB3 or by sb3_eqr.common.checks.validation, which know the context
     *("self", "policy", "env", "replay_buffer_class", "resets", "device", "_init_setup_model"),
     # the policy: set by the algorithm, or parsed by make_group
     *("observation_space", "action_space", "lr_schedule", "group", "kwargs", "stock_kwargs"),

@@ -177,9 +177,9 @@ def test_a_custom_extractor_gets_features_dim():
 
 def test_old_import_paths():
     import sb3_eqr
-    from sb3_eqr.common.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-    from sb3_eqr.common.features_extractor import GroupFeaturesExtractor as encoder
     from sb3_eqr.common.groups import MatrixLieGroup, make_group
+    from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor as encoder
+    from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 
     for name, found in {
         "PrioritizedSequenceReplayBuffer": PrioritizedSequenceReplayBuffer,

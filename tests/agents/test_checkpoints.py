@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 import sb3_eqr
 from sb3_eqr import EqRQRDQN, EqRRainbow, envs
-from sb3_eqr.common.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
+from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.toys import ChainEnv
 

@@ -11,10 +11,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRRainbow
+from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
-from sb3_eqr.common.update_monitor import UpdateMonitor
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
 from tests.models import BOTH, MAKERS, PAPER, loss_terms, untrained
 from tests.toys import ChainEnv, ImageEnv

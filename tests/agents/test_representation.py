@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.latent_model import GroupLatentModel
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import coordinates, encode, split
 from tests.models import EITHER

@@ -200,10 +200,7 @@ def test_after_another_dtype_targets_follow_the_new_tensors(make):
                 statistic.add_("running_" in name)  # or the copies would be equal anyway
     states = [(online.state_dict(), copy.state_dict()) for online, copy in policy.target_copy.pairs]
     expected = [
-        {
-            name: online[name].clone() if is_copied(name) else 0.75 * value + 0.25 * online[name]
-            for name, value in copy.items()
-        }
+        {name: online[name].clone() if is_copied(name) else 0.75 * value + 0.25 * online[name] for name, value in copy.items()}
         for online, copy in states
     ]
     policy.update_target(0.25)

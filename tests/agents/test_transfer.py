@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.groups import SO
-from sb3_eqr.common.transfer import representation
+from sb3_eqr.common.saving.transfer import representation
 from tests.models import BOTH, EITHER, MAKERS, loss_terms
 from tests.toys import ChainEnv, DictEnv
 

@@ -40,11 +40,11 @@ class Promise(NamedTuple):
 # page -> include -> promise, in the order of the page
 PROMISES: dict[str, dict[str, Promise]] = {
     "configurations.md": {
-        "sb3_eqr/common/arguments.py, ALGORITHM: dict": Promise(
+        "sb3_eqr/common/checks/arguments.py, ALGORITHM: dict": Promise(
             code=('"max_grad_norm": number(0, above=True) | NONE', '"seed": integer(0, 2**32 - 1) | NONE'),
             text=("`ALGORITHM`", "`WEIGHT`", "`SHARE`", "`FLAG`"),
         ),
-        "sb3_eqr/common/arguments.py, POLICY: dict": Promise(
+        "sb3_eqr/common/checks/arguments.py, POLICY: dict": Promise(
             code=('"projection": one_of(["head", "own", "none"])', '"n_quantiles": integer(1)'), text=("`POLICY`",)
         ),
     },
@@ -64,19 +64,22 @@ PROMISES: dict[str, dict[str, Promise]] = {
             ),
             text=("`Objective.__call__`", "`reward_coef`", "`aet_coef`", "`symmetry_coef`", "`td_coef`", "$w_i$"),
         ),
-        "sb3_eqr/common/gradients.py, _Branch.backward": Promise(
+        "sb3_eqr/common/latent/gradients.py, _Branch.backward": Promise(
             code=("th.mm(both, both.mT, out=ctx.gram)", "ctx.share * ", "th.addcmul(of_td, of_auxiliary, scale)"),
             text=("`branch`", "`aux_gradient_share=1.0`", "`train/td_state_gradient`"),
         ),
-        "sb3_eqr/common/rollout.py, _Rollout.forward": Promise(
+        "sb3_eqr/common/latent/rollout.py, _Rollout.forward": Promise(
             code=("th.addmm(offset, states[-1], transposed)", "group.act_vjp(params.view(", "th.stack(states[1:], dim=1)"),
-            text=("`rollout` in `sb3_eqr/common/rollout.py`", r"= \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}"),
+            text=(
+                "`rollout` in `sb3_eqr/common/latent/rollout.py`",
+                r"= \kappa_\phi(\hat x_{m-1}, a_{t+m-1}) \cdot \hat x_{m-1}",
+            ),
         ),
         "sb3_eqr/common/losses.py, _NormalizedDistance.forward": Promise(
             code=("difference = directions[0] - directions[1]", "difference.square().sum(dim=-1)"),
             text=("`normalized_distance`", r"\rVert_2^2 = 2 - 2 \cos(y, \bar y)"),
         ),
-        "sb3_eqr/common/latent_model.py, if project is not None and": Promise(
+        "sb3_eqr/common/latent/latent_model.py, if project is not None and": Promise(
             code=("target_project(target_rollout.flatten(", "AET_LOSSES[self.aet_loss](projected, target_projected, mask)"),
             text=("`LatentModel.forward`", "`AET_LOSSES`", r"L_{\mathrm{AET}}"),
         ),
@@ -88,7 +91,7 @@ PROMISES: dict[str, dict[str, Promise]] = {
             code=("cosines / TEMPERATURE", "F.cross_entropy(logits"),
             text=("`contrastive_loss`", '`policy_kwargs=dict(aet_loss="contrastive")`', r"\sum_{j=1}^{B} \exp"),
         ),
-        "sb3_eqr/common/latent_model.py, GroupLatentModel.symmetry_loss": Promise(
+        "sb3_eqr/common/latent/latent_model.py, GroupLatentModel.symmetry_loss": Promise(
             code=("self.group.compose(self.blocks(partner), self.group.inverse(", "self.action_symmetry(", "th.no_grad()"),
             text=("`GroupLatentModel.symmetry_loss`", "`symmetry_coef`", r"\tau_g = \bar x^{(j)}_0 \, x_0^{-1}"),
         ),

@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_eqr import EqRRainbow, load_configuration
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.random_state import get_rng_state
+from sb3_eqr.common.saving.random_state import get_rng_state
 from sb3_eqr.visualize import animation
 from sb3_eqr.visualize.animation import predictions, record, shoot
 from sb3_eqr.visualize.callback import LatentCallback

@@ -24,8 +24,8 @@ from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, SUITE, Run, Settings
 from sb3_eqr.benchmark.scores import load_results
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.common.checkpoints import find_checkpoints
-from sb3_eqr.common.env_state import capture, restore
+from sb3_eqr.common.saving.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.env_state import capture, restore
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 

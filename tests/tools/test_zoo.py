@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
-from sb3_eqr.common.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain

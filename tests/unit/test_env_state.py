@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import envs
-from sb3_eqr.common.env_state import MissingObjectError, capture, restore
+from sb3_eqr.common.saving.env_state import MissingObjectError, capture, restore
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.toys import ChainEnv, ImageEnv
 

@@ -14,8 +14,8 @@ import zipfile
 
 import pytest
 
-from sb3_eqr.common import files
-from sb3_eqr.common.files import atomic_folder, atomic_write, is_unbroken, seal
+from sb3_eqr.common.saving import files
+from sb3_eqr.common.saving.files import atomic_folder, atomic_write, is_unbroken, seal
 
 
 def names(folder):

@@ -7,11 +7,11 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.gradients import assign_gradients, branch, clip_grad_norm
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
+from sb3_eqr.common.latent.gradients import assign_gradients, branch, clip_grad_norm
+from sb3_eqr.common.latent.rollout import HiddenLayer, rollout
 from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.networks.layers import NoisyLinear, draw_noise
-from sb3_eqr.common.rollout import HiddenLayer, rollout
 
 AFFINE = MatrixLieGroup([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]]])
 GROUPS = ["GL(2)", "SE(2)", "SE(3)", "SO(2)", "SO(3)", "T(2)", "none(4)", "SE(2)^2 x SO(3)", AFFINE]

@@ -14,7 +14,7 @@ from sb3_eqr.common.groups import (
     make_group,
 )
 from sb3_eqr.common.groups.matrix import euler_rotation, exp_rotation
-from sb3_eqr.common.plain_data import encode
+from sb3_eqr.common.saving.plain_data import encode
 
 AFFINE_1D = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]]]  # x -> a x + b with a > 0
 

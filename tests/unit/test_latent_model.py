@@ -5,9 +5,9 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_eqr.common.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
+from sb3_eqr.common.latent.latent_model import GroupLatentModel
 
 
 def identity(states):

@@ -16,8 +16,8 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
-from sb3_eqr.common.plain_data import KIND, UntrustedError, decode, encode, names_in
 from sb3_eqr.common.resets import ResetSchedule
+from sb3_eqr.common.saving.plain_data import KIND, UntrustedError, decode, encode, names_in
 from sb3_eqr.eqr_rainbow import CnnPolicy
 
 
@@ -98,7 +98,7 @@ FORGED = [
     {KIND: "class", "module": "torch", "name": "load"},
     {KIND: "object", "module": "os", "name": "environ", "attributes": {}},
     {KIND: "object", "module": "sb3_eqr.common.resets", "name": "check_names", "attributes": {}},
-    {KIND: "class", "module": "sb3_eqr.common.plain_data", "name": "decode"},
+    {KIND: "class", "module": "sb3_eqr.common.saving.plain_data", "name": "decode"},
     {KIND: "space", "name": "Graph", "arguments": {}},
     {KIND: "something"},
 ]

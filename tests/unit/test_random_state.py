@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_eqr.common.random_state import preserved_rng_state
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 
 
 def test_all_generators_are_restored():

@@ -14,8 +14,9 @@ from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.arguments import check, integer, number
+from sb3_eqr.common.checks.arguments import check, integer, number
 from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
+from sb3_eqr.common.losses import rescaled
 from sb3_eqr.common.networks.layers import Centering, Whitening
 from sb3_eqr.common.type_aliases import PyTorchObs
 
@@ -98,18 +99,6 @@ class ResidualBlock(nn.Module):
     def forward(self, images: th.Tensor) -> th.Tensor:
         """Map (B, C, H, W) to (B, C, H, W)."""
         return images + self.conv2(F.relu(self.conv1(F.relu(images)), inplace=True))
-
-
-def rescaled(features: th.Tensor) -> th.Tensor:
-    """
-    Shift and scale the features of each sample to [0, 1] (Schrittwieser et al. 2020,
-    https://arxiv.org/abs/1911.08265; SPR and BBF do this with the output of their convolutions).
-
-    :param features: (B, D)
-    :return: (B, D)
-    """
-    low = features.amin(dim=1, keepdim=True)
-    return (features - low) / (features.amax(dim=1, keepdim=True) - low + 1e-5)
 
 
 class ImageExtractor(BaseFeaturesExtractor):

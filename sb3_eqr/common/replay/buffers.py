@@ -9,11 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_eqr.common.arguments import BUFFER, check_arguments
+from sb3_eqr.common.checks.arguments import BUFFER, check_arguments
+from sb3_eqr.common.checks.validation import check_transition
 from sb3_eqr.common.replay.frame_store import FrameStore
 from sb3_eqr.common.replay.sum_tree import SumTree
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
-from sb3_eqr.common.validation import check_transition
 
 try:
     import psutil

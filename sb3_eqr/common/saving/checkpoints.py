@@ -15,11 +15,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_eqr.common.arguments import ALGORITHM, check, integer
-from sb3_eqr.common.env_state import CLASS, NUMBER, MissingObjectError, capture, restore
-from sb3_eqr.common.files import atomic_folder, checksum, remove_leftovers
-from sb3_eqr.common.plain_data import KIND, decode, encode
-from sb3_eqr.common.random_state import get_rng_state, set_rng_state
+from sb3_eqr.common.checks.arguments import ALGORITHM, check, integer
+from sb3_eqr.common.saving.env_state import CLASS, NUMBER, MissingObjectError, capture, restore
+from sb3_eqr.common.saving.files import atomic_folder, checksum, remove_leftovers
+from sb3_eqr.common.saving.plain_data import KIND, decode, encode
+from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 
 PREFIX = "checkpoint-"  # followed by the step
 MANIFEST, MODEL, BUFFER, ENVIRONMENT = "manifest.json", "model.zip", "replay_buffer.pkl", "environment.json"

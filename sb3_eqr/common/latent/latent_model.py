@@ -15,8 +15,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group
+from sb3_eqr.common.latent.rollout import HiddenLayer, rollout
 from sb3_eqr.common.losses import contrastive_loss, normalized_distance, reward_cross_entropy, reward_mse
-from sb3_eqr.common.rollout import HiddenLayer, rollout
 from sb3_eqr.common.type_aliases import LatentLosses
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -42,7 +42,7 @@ class LatentModel(nn.Module):
     :param reward_loss: "mse" (Eq. 17) or "categorical" (the sign of the reward, as in the authors' released code)
     :param aet_loss: "distance" (Eq. 18) or "contrastive" (:func:`~sb3_eqr.common.losses.contrastive_loss`)
     :param embedding: module from the encoder's features to latent states; ``None``: the features are the latent states
-    :param norm: of the hidden layers, see :class:`~sb3_eqr.common.rollout.HiddenLayer`
+    :param norm: of the hidden layers, see :class:`~sb3_eqr.common.latent.rollout.HiddenLayer`
     :raises ValueError: if a loss is unknown
     """
 

@@ -9,9 +9,9 @@ import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
+from sb3_eqr.common.checks.validation import check_same_parameters
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.save_util import find_file, is_whole_model, read_data
-from sb3_eqr.common.validation import check_same_parameters
+from sb3_eqr.common.saving.models import find_file, is_whole_model, read_data
 
 ENCODER = "features_extractor"
 LATENT_PARTS = ("embedding", "transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task

@@ -8,7 +8,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_eqr.common.validation import check_finite, environment_errors, find_infinite
+from sb3_eqr.common.checks.validation import check_finite, environment_errors, find_infinite
 
 STATISTICS = ("obs_rms", "ret_rms")  # attributes of VecNormalize
 

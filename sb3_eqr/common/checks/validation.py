@@ -16,7 +16,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr.common.arguments import POLICY
+from sb3_eqr.common.checks.arguments import POLICY
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)

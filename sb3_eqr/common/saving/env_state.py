@@ -19,7 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_eqr.common.plain_data import KIND, decode, encode
+from sb3_eqr.common.saving.plain_data import KIND, decode, encode
 
 # Values that are not captured: definitions, and handles to the outside such as loggers.
 FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)

@@ -6,9 +6,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from sb3_eqr.common.plain_data import KIND, decode, encode
 from sb3_eqr.common.replay.frame_store import FrameStore
 from sb3_eqr.common.replay.sum_tree import SumTree
+from sb3_eqr.common.saving.plain_data import KIND, decode, encode
 
 PARTS = {kind.__name__: kind for kind in (FrameStore, SumTree)}  # components of a buffer that hold arrays
 DATA = "data"  # the zip member that holds everything except the arrays

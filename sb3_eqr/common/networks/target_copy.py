@@ -18,7 +18,7 @@ class TargetCopy:
         self.pairs = list(pairs)
         self.is_exact = True  # whether the copies currently equal the networks; False after a gradient step
         self._tensors: tuple[list[th.Tensor], ...] | None = None
-        self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # the copy's count of batches, statistic, its copy
+        self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # count of the copy, statistic, copy
 
     def update(self, tau: float) -> None:
         """

@@ -4,8 +4,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.latent_model import LatentModel
-from sb3_eqr.common.networks.encoders import rescaled
+from sb3_eqr.common.latent.latent_model import LatentModel
+from sb3_eqr.common.losses import rescaled
 
 
 class ConvLatentModel(LatentModel):
@@ -16,9 +16,9 @@ class ConvLatentModel(LatentModel):
     :param map_shape: shape (C, H, W) of the trunk's features
     :param n_actions: A
     :param hidden_dim: width of the hidden layer of r_ψ
-    :param reward_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`
-    :param aet_loss: as in :class:`~sb3_eqr.common.latent_model.LatentModel`; SPR uses "distance"
-    :param norm: of r_ψ, as in :class:`~sb3_eqr.common.latent_model.LatentModel`
+    :param reward_loss: as in :class:`~sb3_eqr.common.latent.latent_model.LatentModel`
+    :param aet_loss: as in :class:`~sb3_eqr.common.latent.latent_model.LatentModel`; SPR uses "distance"
+    :param norm: of r_ψ, as in :class:`~sb3_eqr.common.latent.latent_model.LatentModel`
     """
 
     def __init__(

@@ -18,12 +18,19 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import open_path, recursive_getattr, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_eqr.common.checkpoints import BUFFER, MODEL, read_manifest, restore_environment, restore_generators, warn_of_hidden
-from sb3_eqr.common.files import atomic_write, is_unbroken, seal
-from sb3_eqr.common.plain_data import UntrustedError, decode, encode, names_in
-from sb3_eqr.common.random_state import get_rng_state, set_rng_state
-from sb3_eqr.common.replay.buffer_files import read_buffer, write_buffer
-from sb3_eqr.common.validation import check_names
+from sb3_eqr.common.checks.validation import check_names
+from sb3_eqr.common.saving.buffers import read_buffer, write_buffer
+from sb3_eqr.common.saving.checkpoints import (
+    BUFFER,
+    MODEL,
+    read_manifest,
+    restore_environment,
+    restore_generators,
+    warn_of_hidden,
+)
+from sb3_eqr.common.saving.files import atomic_write, is_unbroken, seal
+from sb3_eqr.common.saving.plain_data import UntrustedError, decode, encode, names_in
+from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 
 SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 
@@ -111,7 +118,7 @@ class SafeFiles(OffPolicyAlgorithm):
     ) -> None:
         """
         As SB3's ``save``, with the state of the random generators; the file is written under a temporary name and renamed.
-        Attributes are saved as plain data (:mod:`~sb3_eqr.common.plain_data`), except that custom classes in
+        Attributes are saved as plain data (:mod:`~sb3_eqr.common.saving.plain_data`), except that custom classes in
         ``policy_kwargs`` are pickled, and need ``trust`` to be loaded.
         """
         self._before_saving()
@@ -197,8 +204,8 @@ class SafeFiles(OffPolicyAlgorithm):
         trust: bool = False,
     ) -> SelfSafeFiles:
         """
-        Resume from a checkpoint of :class:`~sb3_eqr.common.checkpoints.ExactCheckpointCallback`, bit for bit as if the run had
-        not stopped. Then call ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
+        Resume from a checkpoint of :class:`~sb3_eqr.common.saving.checkpoints.ExactCheckpointCallback`, bit for bit as if
+        the run had not stopped. Then call ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
 
         :param path: the checkpoint, or a folder of checkpoints, whose last one is used
         :param env: environment built as in the original run, including VecNormalize

@@ -1,0 +1,1 @@
+"""Checks: legal arguments, environments that fit, and data and updates that are finite."""
