@@ -189,7 +189,7 @@ def pieces(model: Any) -> Iterator[np.ndarray]:
             yield parameter.detach().numpy()
             for _, value in sorted(policy.optimizer.state.get(parameter, {}).items()):
                 yield value.numpy() if isinstance(value, th.Tensor) else np.asarray(value)
-    for module in (policy.target, policy.latent_model_target, policy.own_projection_target):
+    for module in (policy.target, policy.latent_target, policy.latent_encoder):
         if module is not None:
             yield from (parameter.detach().numpy() for parameter in module.parameters())
     yield from (buffer.numpy() for buffer in policy.buffers())

@@ -22,7 +22,6 @@ import torch as th
 from sb3_eqr import EqRRainbow, envs
 from sb3_eqr.common.networks.encoders import ConvExtractor
 from sb3_eqr.common.networks.layers import Centering
-from sb3_eqr.common.objective import LossCoefs
 from sb3_eqr.configurations import load_configuration
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
@@ -74,7 +73,7 @@ def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
     norms = []
     record = model.objective.__class__.__call__
 
-    def watch(objective: Any, samples: Any, coefs: LossCoefs) -> Any:
+    def watch(objective: Any, samples: Any, coefs: Any) -> Any:
         terms = record(objective, samples, coefs)
         norms.append(terms.gram)
         return terms
@@ -138,7 +137,7 @@ def measure(game: str, configuration: str, n_updates: int, n_later: int, n_frame
         for *_, last in networks:
             last.reset_parameters()
     if configuration == "random_predictor":
-        predictor: Any = model.policy.predictor_net
+        predictor: Any = model.policy.latent_model.predictor
         predictor.reset_parameters()
     if configuration == "constant_gradient":
         keep_constant_gradient(model)

@@ -55,7 +55,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     from sb3_eqr.benchmark.evaluation import evaluate
     from sb3_eqr.benchmark.suites import choose, load_suite
     from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-    from sb3_eqr.common.latent.latent_model import GroupLatentModel
+    from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
     from sb3_eqr.visualize.diagnostics import diagnose
     from sb3_eqr.visualize.latents import replayed
 
@@ -93,7 +93,7 @@ def run(trial: dict[str, Any], game: str, seed: int, steps: int) -> dict[str, An
     else:
         scores, _ = evaluate(model, choose(load_suite("minatar"), [game], steps).protocol(game), 100, seed)
     skill = {}
-    if getattr(model, "depth", 0) and isinstance(model.policy.latent_model, GroupLatentModel):
+    if getattr(model, "depth", 0) and not isinstance(model.policy.latent_model, ConvLatentModel):
         found = diagnose(model, replayed(model, 512, np.random.default_rng(seed)), seed)
         skill = {"skill": [round(float(value), 3) for value in found.loss.skill]}  # one to M steps ahead
     curve = [float(np.mean(part)) for part in np.array_split(means.values["rollout/ep_rew_mean"], N_PARTS) if len(part)]

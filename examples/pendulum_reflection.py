@@ -42,7 +42,9 @@ def measure(model: EqRQRDQN, world: PixelPendulum, seed: int) -> dict[str, Any]:
     x = encode(model, images(world, angles, velocities))  # (N, D)
     mirrored = encode(model, images(world, -angles, -velocities))
     latent_model, group = model.policy.latent_model.eval(), model.policy.latent_model.group
-    clockwise, other = (th.full((N_STATES,), action) for action in (0, latent_model.n_actions - 1))  # opposite torques
+    clockwise, other = (
+        model.policy.embed_actions(th.tensor([0, latent_model.action_dim - 1])).repeat_interleave(N_STATES, dim=0).chunk(2)
+    )  # opposite torques
     with th.no_grad():
         symmetry = group.compose(latent_model.blocks(mirrored), group.inverse(latent_model.blocks(x)))  # τ_g
         rho = latent_model.element(latent_model.action_symmetry(symmetry.flatten(1)))

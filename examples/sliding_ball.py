@@ -110,7 +110,7 @@ def prediction_errors(model: EqRQRDQN, world: SlidingBall, places: np.ndarray, n
     latent_model = model.policy.latent_model
     with th.no_grad():
         states = encode(model, images(world, starts))
-        predicted = latent_model.rollout(states, th.as_tensor(actions))[:, -1]  # (n, D)
+        predicted = latent_model.rollout(states, model.policy.embed_actions(th.as_tensor(actions)))[:, -1]  # (n, D)
     nearest = th.cdist(predicted, encode(model, images(world, places))).argmin(dim=1).numpy()
     apart = (places[nearest] - starts - moved / world.n_steps + 0.5) % 1 - 0.5
     return np.linalg.norm(apart, axis=1) / WIDTH

@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.groups import Group
-from sb3_eqr.common.latent.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.latent_model import LatentModel
 from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
@@ -36,7 +36,7 @@ class StillActions(BaseCallback):
 
     def _on_training_start(self) -> None:
         latent_model = self.model.policy.latent_model
-        assert isinstance(latent_model, GroupLatentModel)
+        assert isinstance(latent_model, LatentModel)
         *_, output = latent_model.transition.children()
         assert isinstance(output, nn.Linear)
         identity = latent_model.group.identity_params().repeat(latent_model.n_blocks)

@@ -15,7 +15,8 @@ import numpy as np
 
 from benchmarks.attacks import Finding
 from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
-from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, RESETS, Rule
+from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, Rule, rules_of
+from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import load_configuration
 
@@ -45,13 +46,13 @@ def from_the_tables() -> Iterator[Case]:
         yield f"{name}={value!r}", name, partial(EqRQRDQN, "MlpPolicy", "CartPole-v1", **{name: value})
         if hasattr(model, name) and not isinstance(value, (dict, list)):
             yield f"model.{name}={value!r}", name, partial(set_and_learn, model, name, value)
-    for name, value in refused(POLICY):
+    for name, value in refused(POLICY | rules_of(LatentOptions)):
         kind = EqRQRDQN if name == "n_quantiles" else EqRRainbow
         call = partial(kind, "MlpPolicy", "CartPole-v1", policy_kwargs={name: value})
         yield f"policy_kwargs: {name}={value!r}", name, call
     for name, value in refused(BUFFER, ("alpha", "beta", "final_beta", "frame_stack")):
         yield f"buffer: {name}={value!r}", name, partial(make, replay_buffer_kwargs={name: value})
-    for name, value in refused(RESETS):
+    for name, value in refused(rules_of(ResetSchedule)):
         yield f"resets: {name}={value!r}", name, partial(make, resets={name: value})
 
 

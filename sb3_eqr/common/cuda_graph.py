@@ -11,8 +11,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_eqr.common.latent.gradients import assign_gradients
-from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.networks.optimizers import assign_gradients
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 
@@ -26,7 +25,6 @@ class CapturedGradients:
     The objective must not read values back from the GPU, as a matrix exponential does.
 
     :param objective: a function of samples and coefficients; its result has the scalar ``loss``, which is minimised
-    :param policy: the networks that it evaluates
     :param parameters: the trained parameters; each call overwrites their ``grad``
     """
 
@@ -35,11 +33,9 @@ class CapturedGradients:
     def __init__(
         self,
         objective: Callable[[SequenceReplayBufferSamples, Any], Any],
-        policy: EqRPolicy,
         parameters: list[nn.Parameter],
     ):
         self._objective = objective
-        self._policy = policy
         self._parameters = parameters
         self._device = parameters[0].device
         self._key: Hashable = None
@@ -49,7 +45,7 @@ class CapturedGradients:
         if self._device.type != "cuda":
             self._give_up(f"a CUDA graph needs a GPU, and the device is {self._device.type!r}")
 
-    def __call__(self, samples: SequenceReplayBufferSamples, coefs: Hashable) -> Any:
+    def __call__(self, samples: SequenceReplayBufferSamples, coefs: dict[str, float]) -> Any:
         """
         :param samples: B windows
         :param coefs: weights of the loss terms
@@ -73,22 +69,20 @@ class CapturedGradients:
             parameter.grad = gradient
         return self._terms
 
-    def _key_of(self, samples: SequenceReplayBufferSamples, coefs: Hashable) -> Hashable:
+    def _key_of(self, samples: SequenceReplayBufferSamples, coefs: dict[str, float]) -> Hashable:
         """Everything on which a captured graph depends."""
         return (
-            coefs,
-            self._policy.target_encodes_as_online,
-            self._policy.latent_target_encodes_as_online,
+            tuple(coefs.items()),
             tuple((tensor.shape, tensor.dtype) for tensor in _tensors(samples)),
             tuple((parameter.requires_grad, parameter.data_ptr()) for parameter in self._parameters),
         )
 
-    def _eager(self, samples: SequenceReplayBufferSamples, coefs: Hashable) -> Any:
+    def _eager(self, samples: SequenceReplayBufferSamples, coefs: dict[str, float]) -> Any:
         terms = self._objective(samples, coefs)
         assign_gradients(terms.loss, self._parameters)
         return terms
 
-    def _beside(self, coefs: Hashable) -> Any:
+    def _beside(self, coefs: dict[str, float]) -> Any:
         """Run eagerly on a side stream, as required for the calls before a capture."""
         current, beside = th.cuda.current_stream(self._device), th.cuda.Stream(self._device)
         beside.wait_stream(current)
@@ -97,7 +91,7 @@ class CapturedGradients:
         current.wait_stream(beside)
         return terms
 
-    def _capture(self, coefs: Hashable) -> bool:
+    def _capture(self, coefs: dict[str, float]) -> bool:
         """Capture a call, without executing it, and return whether this succeeded."""
         graph = th.cuda.CUDAGraph()
         try:
@@ -121,7 +115,7 @@ class CapturedGradients:
 
     def __getstate__(self) -> dict[str, Any]:
         # A graph cannot be moved to another process.
-        return {"objective": self._objective, "policy": self._policy, "parameters": self._parameters}
+        return {"objective": self._objective, "parameters": self._parameters}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]

@@ -18,13 +18,12 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, check, check_arguments, number
+from sb3_eqr.common.checks.arguments import ALGORITHM, check, check_arguments, number
 from sb3_eqr.common.checks.finite_data import FiniteData
 from sb3_eqr.common.checks.update_monitor import BadUpdateError, UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedGradients
-from sb3_eqr.common.latent.gradients import assign_gradients, clip_grad_norm
-from sb3_eqr.common.networks.optimizers import set_adam_defaults
-from sb3_eqr.common.objective import LossCoefs, Objective, keep_freed_memory
+from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm, set_adam_defaults
+from sb3_eqr.common.objective import Objective, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
@@ -160,7 +159,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :raises AssertionError: if the action space is not Discrete (as in SB3)
         """
         check_arguments(locals(), ALGORITHM)
-        check_arguments(policy_kwargs or {}, POLICY)
         validation.check_device(device)
         if optimize_memory_usage:
             warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each frame only once.")
@@ -236,12 +234,13 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         keep_freed_memory()
 
     def _set_up_objective(self) -> None:
-        self._options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph
-        self.objective = Objective(self.policy, *self._options[:-1])
-        self._captured = CapturedGradients(self.objective, self.policy, self._trained) if self.cuda_graph else None
-        # The target is equal to the online network for one update per interval, for which a graph would be captured again.
-        is_captured = self._captured is not None and self._captured.failure is None
-        self.policy.shares_passes = not (is_captured and self.target_update_interval)
+        self._objective_options = self._options_of_objective()
+        self.objective = Objective(self.policy, *self._objective_options)
+        self._captured = CapturedGradients(self.objective, self._trained) if self.cuda_graph else None
+
+    def _options_of_objective(self) -> tuple[Any, ...]:
+        target_is_copied = self.tau == 1 and self.target_update_interval is None
+        return self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, target_is_copied
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)
@@ -280,9 +279,15 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
 
     @property
+    def loss_coefs(self) -> dict[str, float]:
+        """The weight λ of each loss by its name."""
+        return {"td": self.td_coef, "aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
+
+    @property
     def depth(self) -> int:
         """The effective M: 0 if all auxiliary losses are disabled."""
-        return self.prediction_depth if self.aet_coef or self.symmetry_coef or self.reward_coef else 0
+        is_used = any(coef for name, coef in self.loss_coefs.items() if name != "td")
+        return self.prediction_depth if is_used else 0
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -321,7 +326,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
         self._check_losses()
         self._check_losses_of_policy()
-        if self._options != (self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, self.cuda_graph):
+        if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):
             self._set_up_objective()
         result = super()._setup_learn(*args, **kwargs)
         if self.learning_starts is None and self._total_timesteps > 0:
@@ -360,11 +365,10 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             if not buffer.can_sample():
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
-            coefs = LossCoefs(self.td_coef, self.aet_coef, self.symmetry_coef, self.reward_coef)
             if self._captured is not None:
-                terms = self._captured(samples, coefs)  # the two lines below, as one CUDA graph
+                terms = self._captured(samples, self.loss_coefs)  # the two lines below, as one CUDA graph
             else:
-                terms = self.objective(samples, coefs)
+                terms = self.objective(samples, self.loss_coefs)
                 assign_gradients(terms.loss, self._trained)
             grad_norm = clip_grad_norm(self._trained, self.max_grad_norm)
             optimizer.step()
@@ -495,4 +499,4 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._log_last_round(check_model=True)  # rolls back instead of saving a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "_options", "objective", "_captured"]
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "_objective_options", "objective", "_captured"]

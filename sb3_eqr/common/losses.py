@@ -1,9 +1,6 @@
 """Losses and rescaling as pure functions. Each loss is one number per sample, so that replay weights can multiply it."""
 
-from typing import Any
-
 import torch as th
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 
@@ -27,37 +24,7 @@ def normalized_distance(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
     :param target: (..., D)
     :return: (...), in [0, 4]
     """
-    return _NormalizedDistance.apply(prediction, target)
-
-
-class _NormalizedDistance(th.autograd.Function):
-    """
-    d = ‖ŷ − ȳ̂‖² of unit vectors, with a hand-written gradient, because autograd needs four times as many operations. With
-    δ = ŷ − ȳ̂, the gradient is 2 (δ − ŷ d/2) / ‖y‖ for the prediction, because ŷ · δ = 1 − ŷ · ȳ̂ = d/2, and the same with −δ
-    for the target.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
-        norms = [th.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min_(1e-12) for y in (prediction, target)]
-        directions = [y / norm for y, norm in zip((prediction, target), norms, strict=True)]
-        difference = directions[0] - directions[1]
-        distance = difference.square().sum(dim=-1)
-        ctx.save_for_backward(difference, distance, *norms, *directions)
-        return distance
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        difference, distance, *rest = ctx.saved_tensors
-        double, distance = 2 * gradient[..., None], distance[..., None]
-        found: list[th.Tensor | None] = [None, None]
-        for i, sign in enumerate((1, -1)):
-            if ctx.needs_input_grad[i]:
-                norm, direction = rest[i], rest[2 + i]
-                tangent = th.addcmul(difference, direction, distance, value=-sign / 2)  # sign * (sign * δ - ŷ d/2)
-                found[i] = tangent * (sign * double / norm)
-        return tuple(found)
+    return (F.normalize(prediction, dim=-1) - F.normalize(target, dim=-1)).square().sum(dim=-1)
 
 
 TEMPERATURE = 0.2  # of contrastive_loss; common values are 0.07 to 0.5, and smaller ones weigh only the nearest negatives

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
-from sb3_eqr.common.checks.arguments import RESETS, check_arguments
+from sb3_eqr.common.checks.arguments import NONE, SHARE, check_fields, integer, option
 from sb3_eqr.common.checks.validation import check_names
 
 
@@ -27,14 +27,14 @@ class ResetSchedule:
     :raises ValueError: if a value is out of range
     """
 
-    interval: int | None = None
-    shrink_factor: float = 0.5
-    initial_n_steps: int | None = None
-    initial_gamma: float | None = None
-    annealing_steps: int = 10_000
+    interval: int | None = option(None, integer(1) | NONE)
+    shrink_factor: float = option(0.5, SHARE)
+    initial_n_steps: int | None = option(None, integer(1) | NONE)
+    initial_gamma: float | None = option(None, SHARE | NONE)
+    annealing_steps: int = option(10_000, integer(1))
 
     def __post_init__(self) -> None:
-        check_arguments(vars(self), RESETS, "resets: ")
+        check_fields(self, "resets: ")
 
     @classmethod
     def of(cls, given: "ResetSchedule | dict[str, Any] | None") -> "ResetSchedule":

@@ -27,11 +27,3 @@ class SequenceReplayBufferSamples(NamedTuple):
     rollout_actions: th.Tensor | None = None  # (B, M), int64: a_t ... a_{t+M-1}
     rollout_rewards: th.Tensor | None = None  # (B, M): r_{t+1} ... r_{t+M}, one-step rewards
     mask: th.Tensor | None = None  # (B, M): 1 where the episode had not ended before step t+m
-
-
-class LatentLosses(NamedTuple):
-    """The three auxiliary losses, one number per sample. ``None``: the loss is disabled."""
-
-    aet: th.Tensor | None  # (B,): action-equivariant transition, Eq. 18
-    symmetry: th.Tensor | None  # (B,): group-equivariant transition (GET), Eq. 19
-    reward: th.Tensor | None  # (B,): reward prediction, Eq. 18

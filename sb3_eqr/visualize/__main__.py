@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{FLAGS.get(name, name)}{space}{message}") from error
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
-    actions, factors = action_names(env, model.policy.latent_model.n_actions), factor_names(env)
+    actions, factors = action_names(env, model.policy.latent_model.action_dim), factor_names(env)
     tables = all_tables(diagnostics, actions, factors)
     write_tables(tables, folder)
     figures = all_pictures(diagnostics, actions, factors)

@@ -156,7 +156,7 @@ def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, sta
     latent_model = model.policy.latent_model
     since = th.as_tensor(np.lib.stride_tricks.sliding_window_view(actions, depth)[:n].copy(), device=states.device)  # (n, M)
     with th.no_grad(), eval_mode(model):
-        predicted = latent_model.rollout(states[:n], since)[:, -1]
+        predicted = latent_model.rollout(states[:n], model.policy.embed_actions(since))[:, -1]
     old_enough = th.as_tensor(np.arange(depth, len(states)) - starts[depth:] >= depth, device=states.device)
     nothing = th.full_like(states, float("nan"))
     return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])

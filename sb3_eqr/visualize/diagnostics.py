@@ -79,7 +79,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     """
     check_agent("diagnose", model)
     data = latents(model, play.samples)
-    project = model.policy.project
+    project = model.policy.latent_model.project
     with th.no_grad(), eval_mode(model):
         start, following, predicted = (
             F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)
@@ -89,7 +89,7 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     motion = find_motion(model, data, data.states[chosen], elements)
     generators = find_generators(model, elements)
     loss = measures.transition_error(start, following, predicted, data.mask)
-    signed = model.policy.latent_model.reward_net[-1].out_features == 3
+    signed = model.policy.options.reward_loss == "categorical"
     return Diagnostics(
         blocks=[f"{part.group} {i}" for part in generators for i in range(part.mean.shape[1])],
         transition=measures.transition_error(data.states, data.next_states, data.predicted, data.mask),

@@ -73,7 +73,7 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
     :param elements: κ of every action in these states, (n, A, D)
     """
     latent_model = group_model(model)
-    n_actions = latent_model.n_actions
+    n_actions = latent_model.action_dim
     before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
     moved = latent_model.act(latent_model.blocks(elements.flatten(0, 1)), before)
     predicted = _block_norms(model, moved - before).unflatten(0, (-1, n_actions)).mean(dim=0)  # (A, K)
@@ -144,10 +144,10 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
         symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
         params = latent_model.action_symmetry(symmetry.flatten(1))
         rho = group.element(params.unflatten(1, (-1, group.num_params)))
-        kappa = latent_model.action_element(data.states, data.actions[:, 0])
-        left = latent_model.projection(latent_model.act(symmetry, data.predicted[:, 0]))
+        kappa = latent_model.action_element(data.states, model.policy.embed_actions(data.actions[:, 0]))
+        left = latent_model.symmetry_projection(latent_model.act(symmetry, data.predicted[:, 0]))
         right, plain = (
-            latent_model.projection(latent_model.act(element, data.states[partner]))
+            latent_model.symmetry_projection(latent_model.act(element, data.states[partner]))
             for element in (group.compose(rho, kappa), kappa)
         )
         distances = [normalized_distance(left, x) for x in (right, plain, right[partner])]

@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
-from sb3_eqr.common.latent.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
+from sb3_eqr.common.latent.latent_model import LatentModel
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -150,17 +151,17 @@ def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> P
     return Play(buffer.windows(starts, envs, model.get_vec_normalize_env()), None)
 
 
-def group_model(model: EqRAlgorithm) -> GroupLatentModel:
+def group_model(model: EqRAlgorithm) -> LatentModel:
     """
     The agent's latent model.
 
     :raises ValueError: if it does not use groups
     """
     found = model.policy.latent_model
-    if not isinstance(found, GroupLatentModel):
+    if isinstance(found, ConvLatentModel):
         raise ValueError(
-            f"The agent's latent model must be a GroupLatentModel, got {type(found).__name__}, whose states have no blocks to "
-            'diagnose. policy_kwargs=dict(transition="group") has them.'
+            f"The agent's latent model must move states by a group, got {type(found).__name__}, whose states have no "
+            'blocks to diagnose. policy_kwargs=dict(transition="group") has them.'
         )
     return found
 
@@ -198,7 +199,7 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     following = encode(model, _map(samples.rollout_observations, lambda obs: obs.flatten(0, 1)))
     latent_model = model.policy.latent_model
     with th.no_grad(), eval_mode(model):
-        predicted = latent_model.rollout(states, actions)
+        predicted = latent_model.rollout(states, model.policy.embed_actions(actions))
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
@@ -221,10 +222,10 @@ def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
     :return: flat like the states, (N, A, D), without gradient
     """
     latent_model = group_model(model)
-    n, n_actions = len(states), latent_model.n_actions
+    n, n_actions = len(states), latent_model.action_dim
     actions = th.arange(n_actions, device=states.device).repeat(n)  # (N * A,)
     with th.no_grad(), eval_mode(model):
-        elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), actions)
+        elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), model.policy.embed_actions(actions))
     return elements.flatten(1).unflatten(0, (n, n_actions))
 
 

@@ -1,6 +1,8 @@
 """The legal values of all arguments, in tables that the constructors, the tests and the documentation use."""
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,25 +129,13 @@ POLICY: dict[str, Rule] = {
     "normalize_images": FLAG,
     "optimizer_class": a_subclass(th.optim.Optimizer, "a class of torch.optim") | TEXT,
     "optimizer_kwargs": DICTIONARY | NONE,
-    "n_blocks": integer(1) | NONE,
-    "parameterization": TEXT,
-    "whiten": FLAG,
     "layer_norm": FLAG,
     "center": FLAG,
     "head_input": one_of(["state", "trunk"]),
     "dueling": FLAG,
     "noisy": FLAG,
     "sigma_init": WEIGHT,
-    "transition": one_of(["group", "convolutional"]),
-    "latent_hidden_dim": integer(1),
-    "latent_norm": one_of(["layer", "batch"]),
-    "projection": one_of(["head", "own", "none"]),
-    "predictor": FLAG,
-    "latent_tau": SHARE | NONE,
-    "state_dependent_actions": FLAG,
     "act_with_target": FLAG,
-    "reward_loss": one_of(["mse", "categorical"]),
-    "aet_loss": one_of(["distance", "contrastive"]),
     "n_atoms": integer(2),
     "v_min": number(),
     "v_max": number(),
@@ -162,13 +152,43 @@ BUFFER: dict[str, Rule] = {
     "beta": SHARE,
     "final_beta": SHARE,
 }
-RESETS: dict[str, Rule] = {
-    "interval": integer(1) | NONE,
-    "shrink_factor": SHARE,
-    "initial_n_steps": integer(1) | NONE,
-    "initial_gamma": SHARE | NONE,
-    "annealing_steps": integer(1),
-}
+
+
+def option(default: Any, rule: Rule) -> Any:
+    """A field of a dataclass with the rule for its values, which :func:`check_fields` checks."""
+    return field(default=default, metadata={"rule": rule})
+
+
+def with_fields_of(options: type) -> Callable[[Any], Any]:
+    """
+    A decorator that shows the fields of a dataclass in the signature of a function, in place of its ``**kwargs``.
+
+    :param options: the dataclass
+    """
+
+    def decorate(function: Any) -> Any:
+        found = inspect.signature(function)
+        *own, kwargs = found.parameters.values()
+        kind = inspect.Parameter.KEYWORD_ONLY
+        shown = [inspect.Parameter(f.name, kind, default=f.default, annotation=f.type) for f in fields(options)]
+        function.__signature__ = found.replace(parameters=[*own, *shown, kwargs])
+        return function
+
+    return decorate
+
+
+def rules_of(options: Any) -> dict[str, Rule]:
+    """The rules of the fields of a dataclass, by name."""
+    return {found.name: found.metadata["rule"] for found in fields(options) if "rule" in found.metadata}
+
+
+def check_fields(options: Any, prefix: str = "") -> None:
+    """
+    :param options: an instance of a dataclass
+    :param prefix: prefix of each name in messages
+    :raises ValueError: for the first field with an illegal value
+    """
+    check_arguments(vars(options), rules_of(options), prefix)
 
 
 def check(name: str, value: Any, rule: Rule) -> None:

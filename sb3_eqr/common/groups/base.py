@@ -1,11 +1,8 @@
 """The interface of all groups, used by the encoder and the latent model (EqR, §3.1 and §4)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 
 import torch as th
-
-Gradients = Callable[[th.Tensor], tuple[th.Tensor, ...]]
 
 
 class Group(ABC):
@@ -47,21 +44,6 @@ class Group(ABC):
         :param right: (..., \\*element_shape), broadcast against ``left``
         :return: (..., \\*element_shape)
         """
-
-    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
-        """
-        Compute ``compose(element(params), right)`` and its vector-Jacobian product, which maps the gradient of the result to
-        the gradients of ``params`` and ``right``. This default uses autograd; groups with a closed form override it. Call it
-        under ``no_grad``.
-
-        :param params: (..., num_params)
-        :param right: (..., \\*element_shape), with the same leading dimensions
-        :return: the result, and the function from its gradient to the two gradients
-        """
-        with th.enable_grad():
-            inputs = params.detach().requires_grad_(), right.detach().requires_grad_()
-            moved = self.compose(self.element(inputs[0]), inputs[1])
-        return moved.detach(), lambda gradient: th.autograd.grad(moved, inputs, gradient, materialize_grads=True)
 
     @abstractmethod
     def inverse(self, element: th.Tensor) -> th.Tensor:

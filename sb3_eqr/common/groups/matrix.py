@@ -3,14 +3,12 @@
 import zlib
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch as th
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from sb3_eqr.common.groups.base import Gradients, Group
+from sb3_eqr.common.groups.base import Group
 
 
 def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
@@ -22,57 +20,14 @@ def euler_rotation(angles: th.Tensor, n: int) -> th.Tensor:
     :return: (..., n, n)
     """
     if n == 2:  # one plane: no product needed
-        return _PlaneRotation.apply(angles) if th.is_grad_enabled() else _plane_rotation(angles)
+        cos, sin = angles.cos(), angles.sin()  # (..., 1)
+        return th.cat([cos, sin, -sin, cos], dim=-1).view(*angles.shape[:-1], 2, 2)
     cos, sin = angles.cos()[..., None], angles.sin()[..., None]  # (..., planes, 1)
     columns = list(th.eye(n, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], n, n).unbind(-1))
     for plane, (i, j) in enumerate(_planes(n)):  # multiplying by R^{ij} from the right mixes columns i and j
         c, s = cos[..., plane, :], sin[..., plane, :]
         columns[i], columns[j] = c * columns[i] - s * columns[j], s * columns[i] + c * columns[j]
     return th.stack(columns, dim=-1)
-
-
-def _plane_rotation(angles: th.Tensor) -> th.Tensor:
-    """R(θ), (..., 2, 2), from angles, (..., 1)."""
-    cos, sin = angles.cos(), angles.sin()
-    return th.cat([cos, sin, -sin, cos], dim=-1).view(*angles.shape[:-1], 2, 2)
-
-
-def _rotate_plane(angles: th.Tensor, columns: th.Tensor) -> tuple[th.Tensor, Gradients]:
-    """
-    R(θ) S, (..., 2, n), from angles, (..., 1), and columns S, (..., 2, n), with the same leading dimensions, and its
-    vector-Jacobian product. The derivative of R(θ) = exp(θE) is E R(θ), which takes a third of the operations needed to
-    differentiate each entry.
-    """
-    rotation = _plane_rotation(angles)
-    rotated = rotation @ columns
-    turned = _turned(rotated)
-    return rotated, lambda gradient: (_gradient_of_angles(gradient, turned), rotation.mT @ gradient)
-
-
-def _turned(rotated: th.Tensor) -> th.Tensor:
-    """The derivative of R(θ) S with respect to θ: E R(θ) S, (..., 2, n)."""
-    return _skew_basis(2, rotated.dtype, rotated.device) @ rotated
-
-
-def _gradient_of_angles(gradient: th.Tensor, turned: th.Tensor) -> th.Tensor:
-    """The gradient of θ, (..., 1), from the gradient of R(θ) S and its derivative, (..., 2, n) each."""
-    return (gradient * turned).sum(dim=(-2, -1))[..., None]
-
-
-class _PlaneRotation(th.autograd.Function):
-    """:func:`_plane_rotation` with the gradient of :func:`_rotate_plane`."""
-
-    @staticmethod
-    def forward(ctx: Any, angles: th.Tensor) -> th.Tensor:
-        rotation = _plane_rotation(angles)
-        ctx.save_for_backward(rotation)
-        return rotation
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
-        (rotation,) = ctx.saved_tensors
-        return _gradient_of_angles(gradient, _turned(rotation))
 
 
 def exp_rotation(angles: th.Tensor, n: int) -> th.Tensor:
@@ -241,11 +196,6 @@ class _Rotations(MatrixGroup):
         self.n = n
         self.parameterization = parameterization
 
-    @property
-    def _turns_plane(self) -> bool:
-        """Whether the rotation is R(θ) in a plane, which has a closed form."""
-        return self.n == 2 and self.parameterization != "gram-schmidt"
-
 
 class SO(_Rotations):
     """Special orthogonal: rotations in n dimensions, n ≥ 2."""
@@ -255,9 +205,6 @@ class SO(_Rotations):
 
     def element(self, params: th.Tensor) -> th.Tensor:
         return self.rotation(params, self.n)
-
-    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
-        return _rotate_plane(params, right) if self._turns_plane else super().act_vjp(params, right)
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
         return element.mT
@@ -279,19 +226,6 @@ class SE(_Rotations):
     def element(self, params: th.Tensor) -> th.Tensor:
         angles, shift = params.split([self.n_angles, self.n], dim=-1)
         return th.cat([self.rotation(angles, self.n), shift[..., None]], dim=-1)  # (..., n, n + 1)
-
-    def act_vjp(self, params: th.Tensor, right: th.Tensor) -> tuple[th.Tensor, Gradients]:
-        if not self._turns_plane:
-            return super().act_vjp(params, right)
-        angles, shift = params.split([self.n_angles, self.n], dim=-1)
-        rotated, pull_back_rotation = _rotate_plane(angles, right)
-
-        def pull_back(gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-            of_angles, of_right = pull_back_rotation(gradient)
-            return th.cat([of_angles, gradient[..., -1]], dim=-1), of_right
-
-        rotated[..., -1].add_(shift)  # [R R', R t' + t]
-        return rotated, pull_back
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
         rotation_inverse = element[..., :-1].mT

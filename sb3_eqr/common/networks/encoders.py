@@ -15,14 +15,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_eqr.common.checks.arguments import check, integer, number
-from sb3_eqr.common.groups import Group, NoGroup, ProductGroup, T, make_group
+from sb3_eqr.common.groups import DEFAULT_GROUP, Group, GroupLayer
 from sb3_eqr.common.losses import rescaled
-from sb3_eqr.common.networks.layers import Centering, Whitening
+from sb3_eqr.common.networks.layers import Centering
 from sb3_eqr.common.type_aliases import PyTorchObs
 
-DEFAULT_GROUP = "SE(2)"  # §7 and Table 5
-DEFAULT_N_BLOCKS = 12  # Table 5, for SE(2) and GL(2)
-DEFAULT_N_TRANSLATIONS = 32  # Table 5, for T(2)
 NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and appendix B.4
 
 
@@ -331,56 +328,6 @@ def make_trunk(
         )
     trunk = trunk_class(observation_space, **trunk_kwargs)
     return NormalizedExtractor(trunk, center) if layer_norm else trunk
-
-
-class GroupLayer(nn.Module):
-    """
-    One linear layer to the Lie algebra, then K group elements, flattened (Eq. 13, appendix B.4).
-
-    :param features_dim: F
-    :param group: see :func:`~sb3_eqr.common.groups.make_group`
-    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the name contains the number of blocks
-        ("SE(2)^8 x SO(3)^4") or is "none"
-    :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
-    :param whiten: whether to whiten the algebra parameters over the batch
-        (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are decorrelated
-    :raises ValueError: if the group is unknown or ``n_blocks`` is below 1
-    """
-
-    def __init__(
-        self,
-        features_dim: int,
-        group: str | Group = DEFAULT_GROUP,
-        n_blocks: int | None = None,
-        parameterization: str = "euler",
-        whiten: bool = False,
-    ):
-        super().__init__()
-        made = make_group(group, parameterization)
-        if n_blocks is None:
-            n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
-            n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
-        check("n_blocks", n_blocks, integer(1))
-        self.group = made
-        self.n_blocks = n_blocks
-        self.state_dim = n_blocks * prod(made.element_shape)  # D
-        factors = [factor for factor, _ in made.factors] if isinstance(made, ProductGroup) else [made]
-        named = {factor.parameterization for factor in factors if hasattr(factor, "parameterization")}  # of objects, too
-        parameterization = ", ".join(sorted(named)) or parameterization
-        self.description = f"{made}^{n_blocks}, {parameterization}"  # the parameters' shapes do not determine the group
-        n_params = n_blocks * made.num_params
-        self.to_algebra: nn.Module = nn.Linear(features_dim, n_params)
-        if whiten:
-            self.to_algebra = nn.Sequential(self.to_algebra, Whitening(n_params))
-
-    def extra_repr(self) -> str:
-        """Group, number of blocks and size of the state."""
-        return f"{self.group}, n_blocks={self.n_blocks}, state_dim={self.state_dim}"
-
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        """Map features, (B, F), to K flattened elements, (B, D)."""
-        params = self.to_algebra(features)  # (B, K * num_params)
-        return self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
 
 
 class GroupFeaturesExtractor(BaseFeaturesExtractor):

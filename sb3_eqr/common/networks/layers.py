@@ -7,7 +7,6 @@ from typing import Any
 
 import torch as th
 from torch import nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 Noise = tuple[th.Tensor, th.Tensor]  # for one layer: f(ε_out), (out_features,), and f(ε_in), (in_features,)
@@ -44,45 +43,16 @@ class NoisyLinear(nn.Module):
         """
         if noise is None:
             return F.linear(inputs, self.weight, self.bias)
+        noise_out, noise_in = noise
         if len(inputs) < self.SMALL_BATCH:
-            noise_out, noise_in = noise
             noisy = F.linear(inputs * noise_in, self.weight_sigma, self.bias_sigma)
             return th.addcmul(F.linear(inputs, self.weight, self.bias), noisy, noise_out)
-        return _NoisyProduct.apply(inputs, self.weight, self.bias, self.weight_sigma, self.bias_sigma, *noise)
+        weight = th.addcmul(self.weight, self.weight_sigma, th.outer(noise_out, noise_in))
+        return F.linear(inputs, weight, th.addcmul(self.bias, self.bias_sigma, noise_out))
 
     def extra_repr(self) -> str:
         """As in ``nn.Linear``."""
         return "in_features={1}, out_features={0}".format(*self.weight.shape)
-
-
-class _NoisyProduct(th.autograd.Function):
-    """
-    The formula of :class:`NoisyLinear` with a hand-written gradient: the gradient of σ_w is that of μ_w times the noise, one
-    product, whereas autograd needs two and copies matrices that are larger than the batch.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        inputs: th.Tensor,
-        weight: th.Tensor,
-        bias: th.Tensor,
-        weight_sigma: th.Tensor,
-        bias_sigma: th.Tensor,
-        noise_out: th.Tensor,
-        noise_in: th.Tensor,
-    ) -> th.Tensor:
-        noise = th.outer(noise_out, noise_in)
-        noisy_weight = th.addcmul(weight, weight_sigma, noise)
-        ctx.save_for_backward(inputs, noisy_weight, noise, noise_out)
-        return F.linear(inputs, noisy_weight, th.addcmul(bias, bias_sigma, noise_out))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        inputs, noisy_weight, noise, noise_out = ctx.saved_tensors
-        of_weight, of_bias = gradient.mT @ inputs, gradient.sum(dim=0)
-        return gradient @ noisy_weight, of_weight, of_bias, of_weight * noise, of_bias * noise_out, None, None
 
 
 def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
@@ -271,48 +241,3 @@ class Centering(nn.Module):
             distance = (self.batch_mean - self.running_mean).square().sum().clamp(min=1e-30)
             weight = (1 - self.BY_CHANCE * self.batch_error / distance).clamp(min=self.SMALLEST_WEIGHT)
             self.running_mean.lerp_(self.batch_mean, weight)
-
-
-class Whitening(nn.Module):
-    """
-    Batch norm over all features jointly: mean 0, variance 1 and no correlations over the batch, using the Cholesky factor of
-    the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). It has no scale and offset, so features cannot
-    collapse to a point. A batch of B samples gives only a noisy estimate of the covariance of D features, so the estimated
-    correlations are shrunk by the fraction D / (D + B), which is therefore not removed: a feature that is determined by the
-    others keeps a variance of about this fraction instead of 1. Eval mode uses running means of the statistics.
-
-    :param n_features: D
-    :param momentum: momentum of the running means, as in PyTorch's batch norm
-    """
-
-    running_mean: th.Tensor  # (D,)
-    running_covariance: th.Tensor  # (D, D)
-    running_count: th.Tensor  # batches so far
-
-    def __init__(self, n_features: int, momentum: float = 0.1):
-        super().__init__()
-        self.momentum = momentum
-        self.register_buffer("running_mean", th.zeros(n_features))
-        self.register_buffer("running_covariance", th.eye(n_features))
-        self.register_buffer("running_count", th.zeros(()))
-
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        """
-        :param features: (B, D); B ≥ 2 in train mode
-        :return: (B, D)
-        """
-        mean, covariance = self.running_mean, self.running_covariance
-        if self.training:
-            n, n_features = features.shape
-            mean = features.mean(dim=0)
-            centred = features - mean
-            variances = th.diag(centred.square().mean(dim=0))
-            covariance = th.lerp(centred.mT @ centred / n, variances, n_features / (n_features + n))
-            with th.no_grad():
-                self.running_count += 1
-                weight = (1 / self.running_count).clamp(min=self.momentum)  # the first batch has weight 1
-                self.running_mean.lerp_(mean, weight)
-                self.running_covariance.lerp_(covariance, weight)
-        smallest = th.diag(1e-5 * covariance.diagonal() + 1e-12)  # relative, because untrained features vary very little
-        factor, _ = th.linalg.cholesky_ex(covariance + smallest)
-        return th.linalg.solve_triangular(factor, (features - mean).mT, upper=False).mT

@@ -1,5 +1,6 @@
-"""Optimisers: lookup by name, defaults and weight decay."""
+"""Optimisers: lookup by name, defaults and weight decay; assigning and clipping gradients with few operations."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch as th
@@ -53,3 +54,39 @@ def decay_matrices_only(model: nn.Module, optimizer: th.optim.Optimizer) -> None
             spared = [p for p in group["params"] if p.ndim < 2 or id(p) in noise]
             group["params"] = [p for p in group["params"] if p.ndim >= 2 and id(p) not in noise]
             optimizer.add_param_group({**group, "params": spared, "weight_decay": 0.0})
+
+
+def clip_grad_norm(parameters: Iterable[nn.Parameter], max_norm: float | None) -> th.Tensor:
+    """
+    As PyTorch's ``clip_grad_norm_``, with a fifth of its operations, for parameters with the same device and dtype.
+
+    :param parameters: parameters, at least one with a gradient; those without are ignored
+    :param max_norm: maximum norm of all gradients together, > 0; ``None``: no clipping
+    :return: the norm before clipping, ()
+    """
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norm = th.linalg.vector_norm(th.stack(th._foreach_norm(gradients)))
+    if max_norm is not None and (norm.is_cuda or norm > max_norm):  # on a GPU, the comparison would force a synchronisation
+        th._foreach_mul_(gradients, (max_norm / (norm + 1e-6)).clamp(max=1.0))
+    return norm
+
+
+def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> None:
+    """
+    As ``loss.backward()``, but replaces the gradients of the parameters instead of accumulating them, which saves one
+    operation per parameter. The gradient of a frozen parameter, or of one that the loss does not depend on, becomes
+    ``None``. As with ``backward``, a gradient has the strides of its parameter: a fused optimiser reads both in the order
+    of memory.
+
+    :param loss: ()
+    :param parameters: the trained parameters
+    """
+    trained = []
+    for parameter in parameters:
+        parameter.grad = None
+        if parameter.requires_grad:
+            trained.append(parameter)
+    for parameter, gradient in zip(trained, th.autograd.grad(loss, trained, allow_unused=True), strict=True):
+        if gradient is not None and gradient.stride() != parameter.stride():
+            gradient = th.empty_like(parameter).copy_(gradient)
+        parameter.grad = gradient

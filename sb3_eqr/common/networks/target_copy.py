@@ -1,7 +1,6 @@
 """Target networks of Q-learning and of the latent model: copies that track the online networks."""
 
 from collections.abc import Sequence
-from itertools import chain
 
 import torch as th
 from torch import nn
@@ -16,9 +15,9 @@ class TargetCopy:
 
     def __init__(self, pairs: Sequence[tuple[nn.Module, nn.Module]]):
         self.pairs = list(pairs)
-        self.is_exact = True  # whether the copies currently equal the networks; False after a gradient step
-        self._tensors: tuple[list[th.Tensor], ...] | None = None
-        self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # count of the copy, statistic, copy
+        self._parameters: tuple[list[th.Tensor], list[th.Tensor]] | None = None  # of the networks, and of their copies
+        self._statistics: tuple[list[th.Tensor], list[th.Tensor]] = [], []  # those that are copied
+        self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # count of the copy, statistic, its copy
 
     def update(self, tau: float) -> None:
         """
@@ -28,49 +27,40 @@ class TargetCopy:
         features (``Centering``, ``Whitening``) belong to the weights that made the features, so they are averaged like the
         weights; the first ones are copied, in place of the initial zeros.
         """
-        online, target, online_statistics, target_statistics = self._found()
-        self.is_exact = tau == 1
+        (online, target), (statistics, copies) = self._found(), self._statistics
         with th.no_grad():
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
                 th._foreach_add_(target, online, alpha=tau)
-                for count, of_online, of_target in self._of_features:
-                    of_target.lerp_(of_online, th.where(count == 0, 1.0, tau))
-                target, online = [], []
-            else:
-                online_statistics = [*online_statistics, *(of_online for _, of_online, _ in self._of_features)]
-                target_statistics = [*target_statistics, *(of_target for _, _, of_target in self._of_features)]
-            target, online = target + target_statistics, online + online_statistics
-            if target:
+            elif target:
                 th._foreach_copy_(target, online)
-
-    def compare(self) -> None:
-        """Check whether the copies are exact after loading parameters."""
-        online, target, online_statistics, target_statistics = self._found()
-        pairs = zip([*online, *online_statistics], [*target, *target_statistics], strict=True)
-        of_features = ((of_online, of_target) for _, of_online, of_target in self._of_features)
-        self.is_exact = all(th.equal(*pair) for pair in chain(pairs, of_features))
+            for count, statistic, copy in self._of_features:
+                copy.lerp_(statistic, th.where(count == 0, 1.0, tau))
+            if copies:
+                th._foreach_copy_(copies, statistics)
 
     def forget_tensors(self) -> None:
         """Call this when moving to another device, because buffers are then replaced by new tensors."""
-        self._tensors = None
+        self._parameters = None
 
-    def _found(self) -> tuple[list[th.Tensor], ...]:
-        """Parameters of the networks and of their copies, then the statistics of both that are copied."""
-        if self._tensors is None:
-            sides = list(zip(*self.pairs, strict=True))
-            online, target = ([module for network in side for module in network.modules()] for side in sides)
-            parameters = [[p for module in side for p in module.parameters()] for side in sides]
-            copied: tuple[list[th.Tensor], list[th.Tensor]] = [], []
-            self._of_features = []
+    def _found(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        if self._parameters is None:
+            online, target = (
+                [part for network in side for part in network.modules()] for side in zip(*self.pairs, strict=True)
+            )
+            self._parameters = _own_parameters(online), _own_parameters(target)
+            self._statistics, self._of_features = ([], []), []
             for module, its_copy in zip(online, target, strict=True):
                 # The buffers themselves, because the tensors of a state dict stop sharing their memory once pickled.
-                found, found_copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
+                found, copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
                 for name in (name for name in found if "running_" in name):
                     if "running_count" in found and name != "running_count":
-                        self._of_features.append((found_copies["running_count"], found[name], found_copies[name]))
+                        self._of_features.append((copies["running_count"], found[name], copies[name]))
                     else:
-                        copied[0].append(found[name])
-                        copied[1].append(found_copies[name])
-            self._tensors = (*parameters, *copied)
-        return self._tensors
+                        self._statistics[0].append(found[name])
+                        self._statistics[1].append(copies[name])
+        return self._parameters
+
+
+def _own_parameters(modules: Sequence[nn.Module]) -> list[th.Tensor]:
+    return [parameter for module in modules for parameter in module.parameters(recurse=False)]

@@ -14,7 +14,7 @@ from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.saving.models import find_file, is_whole_model, read_data
 
 ENCODER = "features_extractor"
-LATENT_PARTS = ("embedding", "transition", "action_symmetry", "projection")  # κ, ρ and b; r_ψ belongs to the task
+LATENT_PARTS = ("embedding", "transition", "action_symmetry", "symmetry_projection")  # κ, ρ and b; r_ψ belongs to the task
 
 
 def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -44,11 +44,8 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
         module.load_state_dict(found[name])
         for parameter in module.parameters():
             policy.optimizer.state.pop(parameter, None)
-    for network in {policy.target, policy.latent_target}:
-        network.features_extractor.load_state_dict(found[ENCODER])
-    for name in LATENT_PARTS:
-        if hasattr(policy.latent_model_target, name):
-            getattr(policy.latent_model_target, name).load_state_dict(found[name])
+    for copy in (policy.target_copy, policy.latent_target_copy):
+        copy.update(1.0)
 
 
 def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
