@@ -8,8 +8,6 @@ from torch import nn
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.latent.rollout import HiddenLayer
-from sb3_eqr.common.objective import LossCoefs
 
 SMALL = {
     "learning_starts": 40,
@@ -52,7 +50,7 @@ EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRai
 
 def loss_terms(model, samples):
     """The loss terms of an update on these samples."""
-    return model.objective(samples, LossCoefs(model.td_coef, model.aet_coef, model.symmetry_coef, model.reward_coef))
+    return model.objective(samples, model.loss_coefs)
 
 
 def untrained(model, before):
@@ -60,7 +58,7 @@ def untrained(model, before):
     The names of the trainable parameters that equal those of the state dict ``before``. Batch norm subtracts the bias of the
     layer before it, so such a bias has no gradient, and may stay.
     """
-    layers = [(name, m) for name, m in model.policy.named_modules() if isinstance(m, HiddenLayer)]
+    layers = [(name, m) for name, m in model.policy.named_modules() if isinstance(m, nn.Sequential) and len(m) > 1]
     without_gradient = {f"{name}.0.bias" for name, layer in layers if isinstance(layer[1], nn.BatchNorm1d)}
     trainable = {name: p for name, p in model.policy.named_parameters() if p.requires_grad and name not in without_gradient}
     return [name for name, parameter in trainable.items() if th.equal(before[name], parameter)]

@@ -252,21 +252,12 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         chosen, given = self.replay_buffer_class, self.replay_buffer_kwargs
         validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
         self._check_losses()
-        noisy = self.policy_kwargs.get("noisy", True)
-        if (
-            self.exploration_final_eps == 0 and not noisy and self._resets.schedule.interval is None
-        ):  # resets also cause exploration
-            warnings.warn(
-                "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
-                "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
-            )
 
     def _check_losses(self) -> None:
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
         if self.representation_frozen:
             self._check_losses_of_frozen()
-        validation.check_whitening(self.policy_kwargs.get("whiten", False), self.batch_size)
 
     def _check_losses_of_frozen(self) -> None:
         if self.td_coef == 0 and (self.reward_coef == 0 or self.depth == 0):
@@ -276,6 +267,13 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             )
 
     def _check_losses_of_policy(self) -> None:
+        validation.check_whitening(self.policy.options.whiten, self.batch_size)
+        explores = self.policy.noisy or self._resets.schedule.interval is not None  # resets also cause exploration
+        if self.exploration_final_eps == 0 and not explores:
+            warnings.warn(
+                "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
+                "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
+            )
         self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
 
     @property

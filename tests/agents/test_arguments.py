@@ -9,7 +9,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
-from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, RESETS, a_list, integer, number, one_of
+from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, a_list, integer, number, one_of, rules_of
+from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.eqr_qrdqn import EqRQRDQNPolicy
@@ -52,7 +53,7 @@ def make(place, name, value):
 
 
 OWN_BUFFER = ("frame_stack", "alpha", "beta", "final_beta")  # the others are the algorithm's
-PLACES = {"algorithm": ALGORITHM, "policy_kwargs": POLICY, "resets": RESETS}
+PLACES = {"algorithm": ALGORITHM, "policy_kwargs": POLICY | rules_of(LatentOptions), "resets": rules_of(ResetSchedule)}
 PLACES["replay_buffer_kwargs"] = {name: BUFFER[name] for name in OWN_BUFFER}
 ARGUMENTS = [(place, name) for place, rules in PLACES.items() for name in rules]
 
@@ -71,11 +72,12 @@ def test_invalid_values_raise_and_name_the_argument(place, name):
 def test_every_argument_has_a_rule():
     signatures = {
         EqRRainbow: ALGORITHM,
-        EqRPolicy: POLICY,
+        EqRPolicy: POLICY | rules_of(LatentOptions),
         EqRRainbowPolicy: POLICY,
         EqRQRDQNPolicy: POLICY,
         PrioritizedSequenceReplayBuffer: BUFFER,
-        ResetSchedule: RESETS,
+        ResetSchedule: rules_of(ResetSchedule),
+        LatentOptions: rules_of(LatentOptions),
     }
     for kind, rules in signatures.items():
         missing = inspect.signature(kind.__init__).parameters.keys() - rules.keys() - NOT_IN_A_TABLE

@@ -71,8 +71,8 @@ def test_the_papers_agent_matches_table_5():
     assert (model.aet_coef / 5, model.symmetry_coef, model.reward_coef / 5) == (1, 1, 1)  # the paper has sums over five steps
     assert (model.replay_buffer.alpha, model.replay_buffer.beta) == (0.5, 0.4)
     policy = model.policy
-    assert (policy.sigma_init, policy.n_blocks, policy.online.head.n_atoms) == (0.5, 12, 51)
-    assert policy.project == policy.online.head.project and policy.latent_target is policy.target
+    assert (policy.sigma_init, policy.latent_model.n_blocks, policy.online.head.n_atoms) == (0.5, 12, 51)
+    assert policy.latent_model.projection is policy.online.head.first and policy.latent_encoder is None
     assert [layer.kernel_size[0] for layer in policy.online.features_extractor.trunk.trunk if hasattr(layer, "stride")] == [
         8,
         4,
@@ -92,7 +92,7 @@ def test_the_full_agent_is_the_default():
         assert getattr(default.replay_buffer, key) == value, key
     assert default.train_freq == named.train_freq
     for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
-        found = getattr(default.policy, key)
+        found = {**vars(default.policy), **vars(default.policy.options)}[key]
         assert (12 if found is None else found) == value  # the default of n_blocks depends on the group
 
 
@@ -129,7 +129,7 @@ def test_each_configuration_trains_as_in_the_table(name):
     assert (layer and f"{layer.group}^{layer.n_blocks}") == encoder_name
     noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
     assert noisy == (name not in ("drq", "eqr_bbf"))
-    assert model.policy.latent_model.n_actions == 3
+    assert model.policy.latent_model.action_dim == 3
 
     # losses: exactly those of the table are logged, and they are finite
     logged = {key[len("train/") : -len("_loss")] for key in recorded if key.endswith("_loss")}
@@ -141,9 +141,9 @@ def test_each_configuration_trains_as_in_the_table(name):
     assert nonzero_gradients(encoder) and nonzero_gradients(model.policy.online.head)
     assert nonzero_gradients(latent.transition) == bool(losses)
     assert nonzero_gradients(latent.reward_net) == ("reward" in losses)
-    of_symmetry = [latent.action_symmetry, latent.projection] if latent.has_symmetry_loss else []
+    of_symmetry = [latent.action_symmetry, latent.symmetry_projection] if latent.has_symmetry_loss else []
     assert all(nonzero_gradients(part) == ("symmetry" in losses) for part in of_symmetry)
-    assert all(p.grad is None for p in [*model.policy.target.parameters(), *model.policy.latent_model_target.parameters()])
+    assert all(p.grad is None for p in [*model.policy.target.parameters(), *model.policy.latent_target.parameters()])
     assert all(not th.equal(before[key], p) for key, p in model.policy.online.named_parameters())
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
 

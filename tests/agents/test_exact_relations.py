@@ -8,7 +8,6 @@ from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
 from sb3_eqr.common.networks.encoders import ConvExtractor, ConvTrunk
-from sb3_eqr.common.policies import EqRPolicy
 from tests.models import BOTH, PAPER, PAPER_FLAT
 from tests.toys import ChainEnv, ImageEnv
 
@@ -113,15 +112,15 @@ def test_same_seed_same_run_and_different_seed_different_run():
 
 
 @BOTH
-def test_sharing_the_target_pass_changes_no_number(network, monkeypatch):
+def test_sharing_the_target_pass_changes_no_number(network):
     """If the target is a copy of the online networks, one pass computes both, with the same results."""
     models = []
     for shortcut in (True, False):
         settings = {**SHARED, "target_update_interval": None, "n_steps": 3, "prediction_depth": 2}
         model = EqRQRDQN("MlpPolicy", ChainEnv(), **settings, policy_kwargs={**network, "noisy": False})
-        assert model.policy.target_encodes_as_online and model.policy.latent_target_encodes_as_online
-        monkeypatch.setattr(EqRPolicy, "target_encodes_as_online", shortcut)
-        monkeypatch.setattr(EqRPolicy, "latent_target_encodes_as_online", shortcut)
+        objective = model.objective
+        assert objective.target_encoder is objective.latent_encoder is objective.encoder
+        if not shortcut:
+            objective.target_encoder = objective.latent_encoder = model.policy.target.features_extractor
         models.append(model.learn(70))
-        monkeypatch.undo()
     assert same_state(*models)

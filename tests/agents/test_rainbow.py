@@ -60,11 +60,11 @@ def test_double_q_by_hand(double_q, goal):
     terms = loss_terms(model, samples)
     cross_entropy = -sum(g * math.log(c) for g, c in zip(goal, current, strict=True))
     entropy = -sum(g * math.log(g) for g in goal if g > 0)
-    assert terms.td.item() == pytest.approx(cross_entropy, rel=1e-5)
+    assert terms.losses["td"].item() == pytest.approx(cross_entropy, rel=1e-5)
     assert terms.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
     assert terms.q_values.item() == pytest.approx(-0.5 + 0.125)
     terminal = loss_terms(model, samples._replace(dones=one))  # all the mass is at 0.5: half goes to 0, half to 1
-    assert terminal.td.item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
+    assert terminal.losses["td"].item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
 
 
 def test_dueling_by_hand():
@@ -159,7 +159,7 @@ def test_both_heads_are_noisy_in_an_update(make, is_noisy):
                 th.nn.init.constant_(layer.weight_sigma, float(name == is_noisy))
                 th.nn.init.constant_(layer.bias_sigma, float(name == is_noisy))
     samples = model.replay_buffer.sample(8)
-    first, second = (loss_terms(model, samples).td for _ in range(2))
+    first, second = (loss_terms(model, samples).losses["td"] for _ in range(2))
     assert not th.allclose(first, second)
 
 
@@ -273,7 +273,7 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
     for name, value in new.items():
         if "_target" in name:
             continue
-        if ".head." in name or name.startswith(("own_projection.", "predictor_net.")):
+        if ".head." in name or name.startswith(("latent_model.projection.", "latent_model.predictor.")):
             assert th.equal(value, drawn[name]) and not th.equal(value, old[name])
             kinds["fresh"] += 1
         elif "running_" in name or "num_batches" in name:
@@ -479,7 +479,7 @@ def test_weight_decay_applies_to_matrices_only(make, name):
     optimizer.step()
     assert {p.ndim for p in model._trained} == {1, 2}
     policy = model.policy
-    parts = [policy.online, policy.latent_model, policy.own_projection, policy.predictor_net]
+    parts = [policy.online, policy.latent_model]
     for key, p in [named for part in parts for named in part.named_parameters()]:
         assert (p == (0.75 if p.ndim == 2 and "sigma" not in key else 1.0)).all(), key  # decay would remove the noise
     trained = {id(p) for group in optimizer.param_groups for p in group["params"]}

@@ -11,7 +11,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.groups import make_group
-from sb3_eqr.common.latent.latent_model import GroupLatentModel
+from sb3_eqr.common.latent.latent_model import LatentModel
+from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import coordinates, encode, split
 from tests.models import EITHER
@@ -113,8 +114,9 @@ def test_weight_of_the_td_loss(make):
 
 
 def test_actions_that_do_not_depend_on_the_state():
-    model = GroupLatentModel(make_group("SE(2)", "gram-schmidt"), 3, 4, state_dependent_actions=False)
-    states, actions = th.randn(5, 18), th.tensor([0, 1, 2, 3, 0])
+    options = LatentOptions(state_dependent_actions=False)
+    model = LatentModel(th.nn.Identity(), make_group("SE(2)", "gram-schmidt"), 3, 4, options)
+    states, actions = th.randn(5, 18), th.eye(4)[[0, 1, 2, 3, 0]]
     elements = model.action_element(states, actions)
     assert th.equal(elements[0], elements[4]) and not th.equal(elements[0], elements[1])
     assert th.equal(elements, model.action_element(th.randn(5, 18), actions))
@@ -141,7 +143,7 @@ def test_every_option_trains_and_is_saved(make, settings, tmp_path):
     model = make(ChainEnv(), **settings).learn(44)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv())
-    assert loaded.policy.aet_loss == model.policy.aet_loss and loaded.td_coef == model.td_coef
+    assert loaded.policy.options == model.policy.options and loaded.td_coef == model.td_coef
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
     loaded.learn(44)
@@ -168,7 +170,7 @@ def test_actions_are_the_identity_until_still_timesteps(group):
 
     def look(local, _):
         latent_model = local["self"].policy.latent_model
-        elements = latent_model.action_element(th.zeros(2, latent_model.group.identity(1).numel()), th.arange(2))
+        elements = latent_model.action_element(th.zeros(2, latent_model.group.identity(1).numel()), th.eye(2))
         is_identity = th.equal(elements, latent_model.group.identity(2, 1))
         found.append((local["self"].num_timesteps, is_identity))
         return True

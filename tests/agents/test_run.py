@@ -140,18 +140,24 @@ def test_defaults_are_those_of_table_5(make):
     assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
     assert model.frame_stack == 4 and model.aux_gradient_share == 1.0
     policy = model.policy
-    assert (policy.layer_norm, policy.head_input, policy.projection, policy.latent_tau) == (True, "trunk", "own", 1.0)
+    assert (policy.layer_norm, policy.head_input, policy.options.projection, policy.options.latent_tau) == (
+        True,
+        "trunk",
+        "own",
+        1.0,
+    )
     assert isinstance(policy.online.features_extractor, NormalizedExtractor)
     assert isinstance(policy.online.features_extractor.trunk, ConvExtractor)
-    assert policy.own_projection.weight.shape == (256, 72) and policy.predictor_net.weight.shape == (256, 256)
+    latent = policy.latent_model
+    assert latent.projection.weight.shape == (256, 72) and latent.predictor.weight.shape == (256, 256)
     papers = make.algorithm("CnnPolicy", env, device="cpu", policy_kwargs=PAPER).policy
-    assert isinstance(papers.online.features_extractor.trunk, ConvExtractor) and papers.own_projection is None
+    assert isinstance(papers.online.features_extractor.trunk, ConvExtractor)
     for policy, n_features, sigma_init in ((model.policy, 3136, 0.1), (papers, 72, 0.5)):
         head, layer = policy.online.head, policy.group_layer
         assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], sigma_init) and head.value is not None
         # σ₀ divided by the square root of the number of inputs
         assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(sigma_init / n_features**0.5)
-        assert (str(layer.group), layer.n_blocks, policy.state_dim) == ("SE(2)", 12, 72)
+        assert (str(layer.group), layer.n_blocks, policy.latent_model.state_dim) == ("SE(2)", 12, 72)
         assert policy.online.features_extractor.features_dim == n_features
         assert sum(p.numel() for p in layer.to_algebra.parameters()) == (3136 + 1) * 36
         assert policy.latent_model.transition[0].out_features == 256
@@ -241,14 +247,16 @@ def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
 @BOTH
 def test_a_custom_extractor_becomes_the_trunk(make, network):
     kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
-    policy = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **kwargs}).learn(46).policy
+    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **kwargs}).learn(46)
+    policy = model.policy
     encoder = policy.online.features_extractor
     assert isinstance(encoder, GroupFeaturesExtractor if network is PAPER else NormalizedExtractor)
     assert isinstance(encoder.trunk, TinyExtractor)
     assert policy.group_layer.to_algebra.in_features == 7
     # With batch norm, online features in train mode differ from target features.
-    assert not policy.target_encodes_as_online and not policy.latent_target_encodes_as_online
-    assert policy.latent_target is not policy.online
+    objective = model.objective
+    assert objective.target_encoder is policy.target.features_extractor
+    assert objective.latent_encoder is (policy.latent_encoder or policy.target.features_extractor) is not encoder
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, "features_extractor_class": NatureCNN}).learn(46)
     assert model.policy.group_layer.to_algebra.in_features == 512
 
@@ -354,7 +362,7 @@ def test_train_mode_applies_to_the_trained_networks_only(make):
         policy.set_training_mode(mode)
         assert policy.training == mode and policy.online.training == mode
         assert all(module.training == mode for module in policy.latent_model.modules())
-        assert not any(m.training for m in [*policy.target.modules(), *policy.latent_model_target.modules()])
+        assert not any(m.training for m in [*policy.target.modules(), *policy.latent_target.modules()])
 
 
 @BOTH
@@ -362,9 +370,9 @@ def test_target_networks_follow_the_online_ones(make, network):
     policy = make(ChainEnv(), policy_kwargs=network).learn(80).policy
     pairs = policy.target_copy.pairs
     if network is PAPER:
-        assert len(pairs) == 3 and policy.latent_target_copy is policy.target_copy  # the encoder with the Q head, κ, b
+        assert len(pairs) == 2 and policy.latent_target_copy is policy.target_copy  # network, latent model
     else:
-        assert len(pairs) == 1 and len(policy.latent_target_copy.pairs) == 4  # p, the map to group elements, κ, b
+        assert len(pairs) == 1 and len(policy.latent_target_copy.pairs) == 1
         pairs = [*pairs, *policy.latent_target_copy.pairs]
     for online, target in pairs:
         for a, b in zip(online.state_dict().values(), target.state_dict().values(), strict=True):
@@ -372,9 +380,8 @@ def test_target_networks_follow_the_online_ones(make, network):
     slow = make(ChainEnv(), tau=0.5, policy_kwargs=network)
     before = [p.clone() for _, target in slow.policy.target_copy.pairs for p in target.parameters()]
     with th.no_grad():
-        for online, _ in slow.policy.target_copy.pairs:
-            for p in online.parameters():
-                p.add_(1.0)
+        for p in {p for online, _ in slow.policy.target_copy.pairs for p in online.parameters()}:  # p of AET may be shared
+            p.add_(1.0)
     slow.policy.update_target(0.5)
     after = [p for _, target in slow.policy.target_copy.pairs for p in target.parameters()]
     for a, b in zip(before, after, strict=True):
@@ -442,7 +449,7 @@ def test_a_run_with_singular_states_of_gl_stays_finite(make, network):
         copy.update(1.0)
     observations = th.rand(2, 3)
     assert (policy.latent_model.embedding(policy.online.features(observations)) == 0).all()
-    assert (policy.latent_model_target.embedding(policy.latent_target.features(observations)) == 0).all()
+    assert (policy.latent_target.embedding(policy.target.features(observations)) == 0).all()
     model.learn(100)
     assert model._n_updates > 0 and all(th.isfinite(p).all() for p in policy.parameters())
     assert (to_algebra.weight != 0).any()

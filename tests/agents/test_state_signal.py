@@ -9,7 +9,7 @@ from torch import nn
 
 from benchmarks.state_signal import signal
 from sb3_eqr import EqRQRDQN, EqRRainbow, GroupFeaturesExtractor, load_configuration
-from sb3_eqr.common.objective import LossCoefs
+from sb3_eqr.common.networks.target_copy import TargetCopy
 from sb3_eqr.envs import make_atari100k_env
 from tests.toys import ChainEnv, ImageEnv
 
@@ -38,10 +38,10 @@ def test_the_head_sees_the_trunk_and_the_latent_model_computes_the_state(latent_
     inputs = th.rand(5, 3)
     features = policy.online.features_extractor(inputs)
     np.testing.assert_allclose(features.detach().std(dim=1, correction=0), 1, atol=2e-2)  # layer norm only
-    assert policy.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == features.shape[1] == 256
+    assert policy.latent_model.state_dim == 4 * 6 and policy.online.head.first[0].weight.shape[1] == features.shape[1] == 256
     elements = layer.group.element(layer.to_algebra(features).view(5, 4, 3)).flatten(1)
     assert th.equal(layer(features), elements)
-    is_up_to_date = th.equal(policy.latent_model_target.embedding(features), elements)
+    is_up_to_date = th.equal(policy.latent_target.embedding(features), elements)
     assert is_up_to_date is (latent_tau == 1.0)
 
 
@@ -69,7 +69,7 @@ def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind,
 
     def gradients(td, aet, reward):
         states.clear()
-        terms = model.objective(samples, LossCoefs(td, aet, 0.0, reward))
+        terms = model.objective(samples, {"td": td, "aet": aet, "symmetry": 0.0, "reward": reward})
         return (*th.autograd.grad(terms.loss, [states[0], weight], retain_graph=True), terms)
 
     of_td, td_weight, _ = gradients(1.0, 0.0, 0.0)
@@ -97,13 +97,13 @@ def test_the_gradients_are_logged():
 def test_the_latent_target_is_updated_separately(latent_tau, whiten):
     model = trained(policy_kwargs={"latent_tau": latent_tau, "whiten": whiten}, target_update_interval=1_000)
     policy = model.policy
-    assert (policy.latent_target is policy.online) == (latent_tau == 1.0 and not whiten)  # otherwise it is a copy
+    assert (policy.latent_encoder is None) == (latent_tau == 1.0)  # otherwise it is a copy
     q_target = [p.clone() for p in policy.target.parameters()]
-    pairs = [(policy.online, policy.latent_target), *policy.latent_target_copy.pairs]
+    pairs = policy.latent_target_copy.pairs
     parameters = [pair for online, target in pairs for pair in zip(online.parameters(), target.parameters(), strict=True)]
     before = [target.clone() for _, target in parameters]
     with th.no_grad():
-        for part in (policy.online, policy.latent_model, policy.own_projection):
+        for part in (policy.online, policy.latent_model):
             for p in part.parameters():
                 p.add_(1.0)
     policy.after_gradient_step()
@@ -113,19 +113,19 @@ def test_the_latent_target_is_updated_separately(latent_tau, whiten):
 
 
 @pytest.mark.parametrize("head_input", ["trunk", "state"])
-def test_a_copied_latent_target_equals_the_online_encoder(head_input, monkeypatch):
+def test_a_copied_latent_target_equals_the_online_encoder(head_input):
     """With latent_tau=1 the online encoder computes x̄₀ ... x̄_M, and x̄₀ together with x₀, with the same results."""
     states = []
     network = {"latent_tau": 1.0, "noisy": False, "head_input": head_input}
     for shortcut in (True, False):
         model = EqRRainbow("MlpPolicy", ChainEnv(), **SETTINGS, target_update_interval=20, policy_kwargs=network)
-        policy = model.policy
-        assert policy.latent_target is policy.online and policy.latent_target_encodes_as_online
+        policy, objective = model.policy, model.objective
+        assert objective.latent_encoder is objective.encoder is not objective.target_encoder
         if not shortcut:
-            policy.latent_network_target = deepcopy(policy.online).requires_grad_(False).eval()
-            policy._make_target_copies()
-            assert policy.latent_target is not policy.online
-            monkeypatch.setattr("sb3_eqr.common.policies.EqRPolicy.latent_target_encodes_as_online", False)
+            objective.latent_encoder = deepcopy(objective.encoder).requires_grad_(False).eval()
+            policy.latent_target_copy = TargetCopy(
+                [*policy.latent_target_copy.pairs, (objective.encoder, objective.latent_encoder)]
+            )
         states.append(model.learn(60).policy.state_dict())
     assert all(th.equal(states[0][key], states[1][key]) for key in states[0])
 
@@ -135,20 +135,24 @@ def test_the_predictor_is_on_the_online_side_only(projection):
     head_input = "state" if projection == "head" else "trunk"
     model = trained(policy_kwargs={"projection": projection, "predictor": True, "head_input": head_input})
     policy = model.policy
-    rows = th.randn(5, policy.state_dim)
-    same = policy._projections(policy.online, policy.own_projection)(rows)
-    assert th.equal(policy.project(rows), policy.predictor_net(same))
-    assert th.equal(policy.target_project(rows), same)  # a copy of the projection, without a predictor
+    rows = th.randn(5, policy.latent_model.state_dim)
+    projected = rows
+    if projection != "none":
+        layer = policy.online.head.first[0] if projection == "head" else policy.latent_model.projection
+        projected = rows @ layer.weight.T + layer.bias
+    predictor = policy.latent_model.predictor
+    th.testing.assert_close(policy.latent_model.project(rows), projected @ predictor.weight.T + predictor.bias)
+    th.testing.assert_close(policy.latent_target.projection(rows), projected)  # a copy of the projection alone
 
 
 def test_a_new_predictor_changes_nothing():
     """As the identity, except with SPR's own transition, which has PyTorch's weights."""
     policy, rows = EqRRainbow("MlpPolicy", ChainEnv(), seed=0).policy, th.randn(5, 72)
-    th.testing.assert_close(policy.project(rows), policy.target_project(rows))
+    th.testing.assert_close(policy.latent_model.project(rows), policy.latent_target.projection(rows))
     spr = {"group": None, "transition": "convolutional", "projection": "none", "predictor": True, "layer_norm": False}
     spr |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]]}}
     policy = EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, seed=0, policy_kwargs=spr).policy
-    assert policy.predictor_net.weight.diagonal().abs().max() < 0.5
+    assert policy.latent_model.predictor.weight.diagonal().abs().max() < 0.5
 
 
 def test_spr_trains_saves_and_loads(tmp_path):
@@ -244,9 +248,11 @@ def test_an_averaged_target_has_centred_features(n_copies, n_averages):
     running mean were copied and the weights averaged, it would be 4 to 6 times as large, and the actions would change.
     """
     settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0, "prediction_depth": 0}
-    model = EqRRainbow("CnnPolicy", make_atari100k_env("Boxing", seed=0), **settings, policy_kwargs={"group": None})
-    model.learn(200).train(n_copies, 32)
-    model.tau = 0.005
+    env = make_atari100k_env("Boxing", seed=0)
+    model = EqRRainbow("CnnPolicy", env, **settings, tau=0.005, policy_kwargs={"group": None}).learn(200)
+    for _ in range(n_copies):
+        model.train(1, 32)
+        model.policy.update_target(1.0)
     model.train(n_averages, 32)
     model.policy.set_training_mode(False)
     frames, offsets = model.replay_buffer.sample(64).observations, []

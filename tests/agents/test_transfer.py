@@ -37,11 +37,10 @@ def test_only_encoder_and_latent_model_are_transferred(tmp_path, giver, taker, n
     assert same(states(old), states(new))
     assert all(th.equal(v, head[k]) for k, v in new.policy.online.head.state_dict().items())
     assert all(th.equal(p, q) for p, q in zip(new.policy.latent_model.reward_net.parameters(), rewards, strict=True))
-    target, online = new.policy.latent_model_target, new.policy.latent_model
+    target, online = new.policy.latent_target, new.policy.latent_model
     assert th.equal(target.transition[0].weight, online.transition[0].weight)
     pairs = [(old.policy.latent_model.embedding, target.embedding)]
-    for part in (new.policy.target, new.policy.latent_target):
-        pairs.append((old.policy.online.features_extractor, part.features_extractor))
+    pairs.append((old.policy.online.features_extractor, new.policy.target.features_extractor))
     pairs = [(given.state_dict(), taken.state_dict()) for given, taken in pairs]
     assert all(given.keys() == taken.keys() and all(th.equal(given[k], taken[k]) for k in given) for given, taken in pairs)
     assert any("to_algebra" in key for given, _ in pairs for key in given)
@@ -153,7 +152,7 @@ def test_states_are_the_same_in_the_new_agent(tmp_path, network):
     new = RAINBOW(ChainEnv(), seed=5, policy_kwargs=network).load_representation(tmp_path / "old")
     observations = th.as_tensor(np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32))
     features = old.policy.online.features(observations)
-    for part in (new.policy.online, new.policy.target, new.policy.latent_target):
+    for part in (new.policy.online, new.policy.target):
         assert th.equal(features, part.features(observations))
-    for model in (new.policy.latent_model, new.policy.latent_model_target):
+    for model in (new.policy.latent_model, new.policy.latent_target):
         assert th.equal(old.policy.latent_model.embedding(features), model.embedding(features))

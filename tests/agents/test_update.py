@@ -1,6 +1,7 @@
 """A single update in detail: targets, weights, priorities, gradients."""
 
 import copy
+import inspect
 
 import numpy as np
 import pytest
@@ -49,9 +50,9 @@ def test_quantile_td_loss_by_loops(double_q, dueling):
                 u = goal[j] - current[i]
                 huber = 0.5 * u * u if abs(u) <= 1 else abs(u) - 0.5
                 expected += abs((i + 0.5) / 9 - (u < 0)) * huber / 9
-        assert td.td[b].item() == pytest.approx(expected, rel=1e-4)
+        assert td.losses["td"][b].item() == pytest.approx(expected, rel=1e-4)
         assert td.q_values[b].item() == pytest.approx(current.mean(), rel=1e-4, abs=1e-6)
-    assert th.equal(td.priorities, td.td)
+    assert th.equal(td.priorities, td.losses["td"])
 
 
 @pytest.mark.parametrize("double_q", [True, False])
@@ -85,78 +86,55 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
         current = now[b, :, samples.actions[b, 0].item()]
         cross_entropy = -sum(goal * current)
         divergence = sum(g * (np.log(g) - c) for g, c in zip(goal, current, strict=True) if g > 0)
-        assert td.td[b].item() == pytest.approx(cross_entropy, rel=1e-5)
+        assert td.losses["td"][b].item() == pytest.approx(cross_entropy, rel=1e-5)
         assert td.priorities[b].item() == pytest.approx(max(divergence, 0), rel=1e-4, abs=2e-6)
         assert td.q_values[b].item() == pytest.approx(np.exp(current) @ support, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("network", [PAPER, {}, {"latent_tau": 0.25}], ids=["paper", "default", "slow latent target"])
-def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, network):
-    """The online and target encodings of s_t, s_{t+1} ... s_{t+M}, each in the right place."""
-    model = trained_model(make, policy_kwargs=network)
-    samples = model.replay_buffer.sample(8)
-    seen = {}
-    forward = type(model.policy.latent_model).forward
-    monkeypatch.setattr(
-        type(model.policy.latent_model), "forward", lambda self, *args: seen.update(args=args) or forward(self, *args)
-    )
+def inputs_of_the_latent_model(model, samples, monkeypatch):
+    """The arguments of the latent model in an update, by name, and the latent encoder's inputs."""
+    seen, kind = {}, type(model.policy.latent_model)
+    forward, names = kind.forward, list(inspect.signature(kind.forward).parameters)[1:]
+
+    def watched(self, *args):
+        seen.update(zip(names, args, strict=True))
+        return forward(self, *args)
+
+    monkeypatch.setattr(kind, "forward", watched)
     loss_terms(model, samples)
-    state, actions, rewards, mask, target_state, target_rollout = seen["args"][:6]
-    policy = model.policy
+    return seen
 
-    def expected_states(observations):
-        return policy.latent_model_target.embedding(policy.latent_target.features(observations)).detach()
 
-    encoded = policy.latent_model.embedding(policy.online.features(samples.observations))
-    th.testing.assert_close(state, encoded)
-    # If the target is a different network, its states must differ, otherwise the test proves nothing.
-    assert (policy.latent_target is policy.online) == (network == {})
-    assert th.allclose(encoded, expected_states(samples.observations)) == (network == {})
-    assert actions is samples.rollout_actions and rewards is samples.rollout_rewards and mask is samples.mask
-    assert target_rollout.shape[1] == 2 and not target_rollout.requires_grad and not target_state.requires_grad
-    th.testing.assert_close(target_state, expected_states(samples.observations))
+@pytest.mark.parametrize("network", [PAPER, {}, {"latent_tau": 0.25}], ids=["paper", "default", "slow latent target"])
+def test_target_features_reach_the_latent_model_in_order(make, monkeypatch, network):
+    """The online and target features of s_t, s_{t+1} ... s_{t+M}, each in the right place."""
+    model = trained_model(make, policy_kwargs=network)
+    samples, policy = model.replay_buffer.sample(8), model.policy
+    seen = inputs_of_the_latent_model(model, samples, monkeypatch)
+    target = {"paper": policy.target.features_extractor, "default": policy.online.features_extractor}
+    encoder = policy.latent_encoder or target["paper" if network else "default"]
+    encoded = policy.online.features_extractor(samples.observations)
+    th.testing.assert_close(seen["features"], encoded)
+    # If the target is a different network, its features must differ, otherwise the test proves nothing.
+    assert th.allclose(encoded, encoder(samples.observations)) == (network == {})
+    hot = th.nn.functional.one_hot(samples.rollout_actions * samples.mask.long(), 3).float()
+    assert th.equal(seen["actions"], hot) and seen["target"] is policy.latent_target
+    assert seen["rewards"] is samples.rollout_rewards and seen["mask"] is samples.mask
+    rollout = seen["target_rollout"].view(8, 2, -1)
+    assert not rollout.requires_grad
+    th.testing.assert_close(seen["target_features"].detach(), encoder(samples.observations).detach())
     for m in range(2):
-        th.testing.assert_close(target_rollout[:, m], expected_states(samples.rollout_observations[:, m]))
-
-
-@pytest.mark.parametrize("network", [{}, {"latent_tau": 0.25}, {"latent_tau": 0.25, "predictor": False}])
-def test_targets_are_projected_by_the_copy_and_without_the_predictor(make, monkeypatch, network):
-    """The two projections of the AET loss, by hand."""
-    model = trained_model(make, learning_rate=1e-2, policy_kwargs=network)
-    policy, seen = model.policy, {}
-    with th.no_grad():  # by chance, they could still be those of the start
-        for layer in filter(None, (policy.own_projection_target, policy.predictor_net)):
-            layer.bias.add_(0.5)
-    kind = type(policy.latent_model)
-    forward = kind.forward
-    monkeypatch.setattr(kind, "forward", lambda self, *args: seen.update(args=args) or forward(self, *args))
-    loss_terms(model, model.replay_buffer.sample(8))
-    project, target_project = seen["args"][7:9]
-    rows = th.randn(5, policy.state_dim)
-
-    def linear(layer, inputs):
-        return inputs @ layer.weight.T + layer.bias
-
-    online, target = (linear(layer, rows) for layer in (policy.own_projection, policy.own_projection_target))
-    assert not th.allclose(online, target)
-    online = linear(policy.predictor_net, online) if network.get("predictor", True) else online
-    th.testing.assert_close(project(rows), online)
-    th.testing.assert_close(target_project(rows), target)
+        th.testing.assert_close(rollout[:, m], encoder(samples.rollout_observations[:, m]).detach())
 
 
 @EITHER
 def test_the_target_encodes_the_same_augmented_image(make, monkeypatch):
-    """A target that equals the online encoder gives the same x₀, although both are computed."""
+    """A target that equals the online encoder gives the same features, although both are computed."""
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}).learn(44)
-    policy, seen = model.policy, {}
-    policy.latent_target_copy.update(1.0)
-    policy.latent_target_copy.is_exact = False
-    kind = type(policy.latent_model)
-    forward = kind.forward
-    monkeypatch.setattr(kind, "forward", lambda self, *args: seen.update(args=args) or forward(self, *args))
-    loss_terms(model, model.replay_buffer.sample(8))
-    assert seen["args"][4] is not seen["args"][0]
-    th.testing.assert_close(seen["args"][4], seen["args"][0].detach())
+    model.policy.latent_target_copy.update(1.0)
+    seen = inputs_of_the_latent_model(model, model.replay_buffer.sample(8), monkeypatch)
+    assert seen["target_features"] is not seen["features"]
+    th.testing.assert_close(seen["target_features"], seen["features"].detach())
 
 
 def test_an_update_sees_normalised_observations_and_rewards(make, monkeypatch):
@@ -196,10 +174,19 @@ def test_replay_weights_multiply_every_loss(make):
 def test_the_loss_is_the_weighted_mean_of_its_terms(make):
     model = trained_model(make)
     samples = model.replay_buffer.sample(8)._replace(weights=th.rand(8))
-    terms = model.objective(samples, objective.LossCoefs(td=2.0, aet=0.5, symmetry=0.25, reward=3.0))
-    expected = 2.0 * terms.td + 0.5 * terms.aet + 0.25 * terms.symmetry + 3.0 * terms.reward
-    assert min(term.abs().min() for term in (terms.td, terms.aet, terms.symmetry)) > 0
-    th.testing.assert_close(terms.loss, (samples.weights * expected).mean())
+    coefs = {"td": 2.0, "aet": 0.5, "symmetry": 0.25, "reward": 3.0}
+    losses, loss, *_ = model.objective(samples, coefs)
+    expected = 2.0 * losses["td"] + 0.5 * losses["aet"] + 0.25 * losses["symmetry"] + 3.0 * losses["reward"]
+    assert min(losses[name].abs().min() for name in ("td", "aet", "symmetry")) > 0
+    th.testing.assert_close(loss, (samples.weights * expected).mean())
+
+
+@pytest.mark.parametrize("name", ["td", "aet", "symmetry", "reward"])
+def test_a_loss_with_weight_0_is_not_computed(make, name):
+    model = trained_model(make)
+    samples = model.replay_buffer.sample(8)
+    losses = model.objective(samples, {**model.loss_coefs, name: 0.0}).losses
+    assert losses.keys() == model.loss_coefs.keys() - {name}
 
 
 def test_new_priorities_come_from_the_td_loss(make):
@@ -234,34 +221,19 @@ def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, en
     monkeypatch.setattr(encoder, "forward", watched)
     model.train(1, 8)
     online, target = model.policy.online.features_extractor, model.policy.target.features_extractor
-    # s_t with gradient, then the target's inputs: s_{t+n} and M steps of rollout, in one pass if one network computes both.
-    following = [(target, 8 + 8 * 2)] if network else [(target, 8), (online, 8 * 2)]
-    assert calls == [(online, 8), *following]
+    # s_t with gradient, then s_{t+n} and the rollout. The paper's target is the online network, too, but in eval mode.
+    encoder = target if model.objective.target_encoder is target else online
+    assert calls == [(online, 8), (encoder, 8), *([(online, 8)] if encoder is target else []), (encoder, 8 * 2)]
 
 
 @pytest.mark.parametrize("symmetry_coef, n_encoded", [(0.0, 8 * 2), (1.0, 8 + 8 * 2)])
 def test_the_target_encodes_the_first_state_for_the_get_loss_only(make, monkeypatch, symmetry_coef, n_encoded):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}, symmetry_coef=symmetry_coef).learn(44)
-    encoder, calls = model.policy.latent_target.features_extractor, []
+    encoder, calls = model.policy.latent_encoder, []
     forward = type(encoder).forward
     monkeypatch.setattr(type(encoder), "forward", lambda self, obs: calls.append((self, len(obs))) or forward(self, obs))
     model.train(1, 8)
     assert sum(n for network, n in calls if network is encoder) == n_encoded
-
-
-@pytest.mark.parametrize("policy, size", [("CnnPolicy", 36 * 36), ("MultiInputPolicy", 64 * 64 + 5)])
-def test_a_pass_on_a_cpu_is_split_into_pieces(make, monkeypatch, policy, size):
-    """Computing in pieces gives the same losses, to rounding."""
-    env = ImageEnv() if policy == "CnnPolicy" else SimpleMultiObsEnv(channel_last=True)
-    model = make(env, policy, shift_pixels=0, intensity_scale=0.0).learn(44)
-    samples, losses = model.replay_buffer.sample(8), []
-    for at_a_time, n_pieces in ((1, 8), (3 * size, 3), (10**9, 1)):
-        monkeypatch.setattr(objective, "_PIECE", at_a_time)
-        assert len(list(objective.in_pieces(samples.next_observations))) == n_pieces
-        th.manual_seed(0)
-        losses.append(loss_terms(model, samples).aet)
-    th.testing.assert_close(losses[0], losses[2])
-    th.testing.assert_close(losses[1], losses[2])
 
 
 @EITHER

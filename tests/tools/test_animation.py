@@ -120,7 +120,7 @@ def rollout(model, state, actions):
     latent_model.eval()
     with th.no_grad():
         for action in actions:
-            one_hot = th.nn.functional.one_hot(th.tensor([int(action)]), latent_model.n_actions).float()
+            one_hot = th.nn.functional.one_hot(th.tensor([int(action)]), latent_model.action_dim).float()
             params = latent_model.transition(th.cat([state, one_hot], dim=1))
             group = latent_model.group
             element = group.element(params.reshape(1, latent_model.n_blocks, group.num_params))
@@ -370,6 +370,6 @@ def test_other_agents_raise():
 
 def test_spr_is_refused_at_the_start():
     model = EqRRainbow("CnnPolicy", make_vec_env(ImageEnv), device="cpu", **load_configuration("spr", buffer_size=100))
-    with pytest.raises(ValueError, match="must be a GroupLatentModel, got ConvLatentModel, whose states have no blocks"):
+    with pytest.raises(ValueError, match="must move states by a group, got ConvLatentModel, whose states have no blocks"):
         model.learn(10, callback=LatentCallback(log_freq=1_000))
     assert model.num_timesteps == 0

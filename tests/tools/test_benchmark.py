@@ -392,7 +392,7 @@ def test_an_entry_without_eqr_builds_its_agent(algo):
     entry = hyperparameters(find_agent(f"{algo}:off"), protocol, spaces.Discrete(2))
     arguments = with_schedule({key: value for key, value in entry.items() if key not in ZOO_KEYS})
     model = ALGOS[algo](entry["policy"], "CartPole-v1", **arguments)
-    assert model.depth == 0 and model.policy.group is None and model.gamma == entry["gamma"]
+    assert model.depth == 0 and model.policy.options.group is None and model.gamma == entry["gamma"]
 
 
 def test_scores_without_runs(tmp_path):

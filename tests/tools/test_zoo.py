@@ -364,7 +364,7 @@ def test_the_search_space_makes_agents(name):
         assert HYPERPARAMS_CONVERTER[name](trial.params) == sampled and sampled["policy_kwargs"]["log_std"] == 1
         del sampled["policy_kwargs"]["log_std"]
         model = ALGOS[name]("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu", **sampled)
-        groups.add(str(model.policy.group))
+        groups.add(str(model.policy.options.group))
         assert model.gradient_steps >= 1 and (name == "eqr_qrdqn") != ("v_max" in sampled["policy_kwargs"])
     assert len(groups) > 1
 

@@ -6,6 +6,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_eqr.common.checks.arguments import POLICY, check_arguments
 from sb3_eqr.common.networks.layers import NoisyLinear
 
 ADAM_EPS = 1.5e-4  # Table 5
@@ -39,6 +40,7 @@ def set_adam_defaults(policy_kwargs: dict[str, Any], device: th.device) -> None:
     :param policy_kwargs: the agent's ``policy_kwargs``, changed in place
     :param device: the agent's device
     """
+    check_arguments(policy_kwargs, {name: POLICY[name] for name in ("optimizer_class", "optimizer_kwargs")})
     policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
     if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
         given = policy_kwargs.get("optimizer_kwargs") or {}
