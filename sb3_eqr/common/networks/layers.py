@@ -136,7 +136,6 @@ class DistributionalHead(nn.Module):
         streams = [MLP([*(net_arch or [features_dim]), size], activation_fn, sigma_init) for size in sizes]
         self.advantage, self.value = streams[0], streams[1] if dueling else None
         self.activation = activation_fn()
-        self.projection_dim = sum(widths)  # P of :meth:`project`
         modules = [self.first, *streams]
         self._noisy_layers = [layer for module in modules for layer in module if isinstance(layer, NoisyLinear)]
 
@@ -164,15 +163,6 @@ class DistributionalHead(nn.Module):
         """
         last: Any = (self.advantage if self.value is None else self.value)[-1]
         last.bias += outputs.repeat_interleave(len(last.bias) // self.n_atoms)  # (N * A,) or (N,)
-
-    def project(self, features: th.Tensor) -> th.Tensor:
-        """
-        The projection p of the AET loss: the first layer of each stream, before the activation, without noise (appendix B.4).
-
-        :param features: (N, D)
-        :return: (N, P), where P is the first hidden size, or twice that with ``dueling``
-        """
-        return self.first(features)
 
 
 class Centering(nn.Module):
