@@ -139,7 +139,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             the first layer of the Q head, which the AET loss trains with projection="head"
         :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
         :param prioritized_replay: whether to sample by priority and weight all losses (Schaul et al. 2016), or uniformly
-        :param shift_pixels: random shift of images, in pixels; 0 disables it
+        :param shift_pixels: random shift of images, in pixels, at most one for each 16 of the smaller side; 0 disables it.
+            Neither this nor the next applies where the trunk flattens images ("mlp", "flatten")
         :param intensity_scale: random intensity of images; 0 disables it
         :param resets: periodic resets, and annealing of n and γ: a :class:`~sb3_eqr.common.resets.ResetSchedule`, or
             its fields as a dictionary; ``None``: neither

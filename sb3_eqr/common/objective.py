@@ -7,9 +7,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.latent.gradients import branch
+from sb3_eqr.common.networks.encoders import MlpExtractor, trunk_of
 from sb3_eqr.common.policies import EqRPolicy, ignores_mode
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
@@ -44,7 +46,7 @@ class Objective:
 
     :param policy: online and target network, latent model
     :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
-    :param shift_pixels: random shift of images, in pixels, ≥ 0
+    :param shift_pixels: random shift of images, in pixels, ≥ 0, see :class:`Augmentation`
     :param intensity_scale: random intensity of images, ≥ 0
     :param aux_gradient_share: maximum norm of the auxiliary losses' gradient at the features, as a share of the TD
         gradient's norm; ``None``: no cap
@@ -64,8 +66,10 @@ class Objective:
         self.policy = policy
         self.double_q = double_q
         self.aux_gradient_share = aux_gradient_share
-        self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
         self.encoder = policy.online.features_extractor
+        if isinstance(trunk_of(self.encoder), (MlpExtractor, FlattenExtractor)):
+            shift_pixels, intensity_scale = 0, 0.0  # it takes each pixel for a number of its own
+        self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
         is_online = target_is_copied and ignores_mode(self.encoder)
         self.target_encoder = self.encoder if is_online else policy.target.features_extractor
         of_latent = self.target_encoder if policy.options.latent_tau is None else self.encoder
@@ -144,15 +148,24 @@ def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
 class Augmentation:
     """
     Prepare observations for the networks in an update: shift images (also those in a dict), scale their intensity, then apply
-    SB3's ``preprocess_obs``. ``normalize_images``: whether images are bytes, which SB3 divides by 255, or already floats.
+    SB3's ``preprocess_obs``.
+
+    :param observation_space: of the observations
+    :param normalize_images: whether images are bytes, which SB3 divides by 255, or already floats
+    :param shift_pixels: maximum shift, ≥ 0, but at most one for each ``SIDE_PER_PIXEL`` pixels of the smaller side: a shift
+        by 4 would move most of an image of 7×7 out of sight
+    :param intensity_scale: of the random intensity, ≥ 0
     """
+
+    SIDE_PER_PIXEL = 16  # Table 5 has 4 for 84 pixels, one for each 21
 
     def __init__(self, observation_space: spaces.Space, normalize_images: bool, shift_pixels: int, intensity_scale: float):
         is_dict = isinstance(observation_space, spaces.Dict)
         self._spaces = observation_space.spaces if is_dict else {"": observation_space}  # type: ignore[attr-defined]
         self.image_keys = [k for k, s in self._spaces.items() if is_image_space(s, normalized_image=not normalize_images)]
         self._normalize_images = normalize_images
-        self.shift_pixels = shift_pixels
+        sides = {key: min(self._spaces[key].shape[-2:]) for key in self.image_keys}  # type: ignore[index]
+        self.shifts = {key: min(shift_pixels, side // self.SIDE_PER_PIXEL) for key, side in sides.items()}
         self.intensity_scale = intensity_scale
 
     def __call__(self, observations: PyTorchObs) -> PyTorchObs:
@@ -163,8 +176,8 @@ class Augmentation:
 
     def _part(self, key: str, observations: th.Tensor) -> th.Tensor:
         if key in self.image_keys:
-            if self.shift_pixels > 0:
-                observations = random_shift(observations, self.shift_pixels)
+            if self.shifts[key] > 0:
+                observations = random_shift(observations, self.shifts[key])
             if self.intensity_scale > 0:  # in one pass with the division of preprocess_obs: this is the largest tensor
                 unit = 1 / 255 if self._normalize_images else 1.0
                 return random_intensity(observations, self.intensity_scale, unit).float()

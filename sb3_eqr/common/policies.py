@@ -26,9 +26,9 @@ from sb3_eqr.common.networks.encoders import (
     GroupFeaturesExtractor,
     ImageExtractor,
     MlpExtractor,
-    NormalizedExtractor,
     find_trunk,
     make_trunk,
+    trunk_of,
 )
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead
 from sb3_eqr.common.networks.optimizers import decay_matrices_only, find_optimizer
@@ -343,7 +343,7 @@ class EqRPolicy(BasePolicy):
 
 def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
     """Shape (C, H, W) of the feature map for a convolutional transition; raises ValueError if features are not a map."""
-    trunk = encoder.trunk if isinstance(encoder, NormalizedExtractor) else encoder
+    trunk = trunk_of(encoder)
     if not isinstance(trunk, ImageExtractor) or trunk.linear is not None:
         raise ValueError(
             'features_extractor_class must be an image trunk without a linear layer if transition="convolutional", '

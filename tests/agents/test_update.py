@@ -3,6 +3,7 @@
 import copy
 import inspect
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -307,3 +308,38 @@ def test_the_learning_rate_is_never_negative(make):
     model.learn(150)  # ends at 192
     assert model.num_timesteps == 192 and min(seen) == 0
     assert all(group["lr"] >= 0 for group in model.policy.optimizer.param_groups)
+
+
+class Board(gym.Env):
+    """A 7×7 board of bytes, whose one piece is at the edge."""
+
+    observation_space = spaces.Box(0, 255, (7, 7, 3), np.uint8)
+    action_space = spaces.Discrete(2)
+
+    def board(self):
+        found = np.zeros((7, 7, 3), np.uint8)
+        found[0, self.np_random.integers(7)] = 255
+        return found
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.board(), {}
+
+    def step(self, action):
+        return self.board(), 0.0, False, self.np_random.random() < 0.1, {}
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy"])
+def test_no_piece_is_shifted_out_of_a_small_board(make, policy):
+    """A shift by 4 pixels would lose most of them; flattened bytes keep their brightness, too."""
+    network = {"features_extractor_kwargs": {"layers": [[8, 3, 1]]}} if policy == "CnnPolicy" else {}
+    model = make(Board(), policy, policy_kwargs=network).learn(46)
+    found = model.objective.augment(model.replay_buffer.sample(32).observations)  # (32, 3, 7, 7)
+    assert ((found > 0.5).flatten(1).sum(dim=1) == 3).all()
+    assert (policy == "CnnPolicy") == bool(((found > 0) & (found != 1)).any())
+
+
+@pytest.mark.parametrize("side, shift", [(84, 4), (64, 4), (40, 2), (15, 0)])
+def test_the_shift_is_small_for_the_image(side, shift):
+    space = spaces.Dict({"picture": spaces.Box(0, 255, (1, side, 96), np.uint8), "speed": spaces.Box(-1, 1, (2,))})
+    assert objective.Augmentation(space, True, 4, 0.0).shifts == {"picture": shift}

@@ -330,6 +330,13 @@ def make_trunk(
     return NormalizedExtractor(trunk, center) if layer_norm else trunk
 
 
+def trunk_of(encoder: nn.Module) -> nn.Module:
+    """The trunk inside an encoder, below layer norm and group layer."""
+    while isinstance(encoder, (NormalizedExtractor, GroupFeaturesExtractor)):
+        encoder = encoder.trunk
+    return encoder
+
+
 class GroupFeaturesExtractor(BaseFeaturesExtractor):
     """
     A trunk and a :class:`GroupLayer`: τ_θ of Eq. 13.
