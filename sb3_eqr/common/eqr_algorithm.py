@@ -40,7 +40,7 @@ MAX_LEARNING_STARTS = 2_000  # Table 5, of 100,000 steps
 class EqRAlgorithm(FiniteData, SafeFiles):
     """
     Mixin, listed before an SB3 Q-learning algorithm. Each update samples windows, adds the auxiliary losses to the TD loss,
-    makes one backward pass, one gradient clipping and one optimiser step, and updates targets and priorities. The policy's
+    makes one backward pass, clips the gradients, makes one optimiser step, and updates targets and priorities. The policy's
     networks define the Q head and its loss.
     """
 
@@ -127,7 +127,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param exploration_initial_eps: initial value of random action probability; above 1: all actions are random until it
             falls below 1
         :param exploration_final_eps: final value of random action probability
-        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), over all trained parameters
+        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), of the network with its Q head
+            and of the latent model, each
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 disables it
@@ -230,6 +231,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         if self.representation_frozen:
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
+        of_network = {*self.policy.online.parameters()}  # the others are the latent model's own
+        self._clipped = [[p for p in self._trained if (p in of_network) == is_network] for is_network in (True, False)]
         self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
         self._set_up_objective()
         keep_freed_memory()
@@ -369,7 +372,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             else:
                 terms = self.objective(samples, self.loss_coefs)
                 assign_gradients(terms.loss, self._trained)
-            grad_norm = clip_grad_norm(self._trained, self.max_grad_norm)
+            grad_norm = self._clip_gradients()
             optimizer.step()
             self._n_updates += 1
             policy.after_gradient_step()
@@ -379,6 +382,16 @@ class EqRAlgorithm(FiniteData, SafeFiles):
                 buffer.update_priorities(samples.indices, terms.priorities)
             self._monitor.add({**terms.metrics(), "grad_norm": grad_norm})
         self._log_counts(buffer)
+
+    def _clip_gradients(self) -> th.Tensor:
+        """
+        Clip the gradients of the network and those of the latent model, each to ``max_grad_norm``: that of the reward loss grows
+        with the square of the rewards, that of Q-learning in proportion, so that one clip would leave nothing of Q-learning.
+
+        :return: the norm of all gradients before clipping, ()
+        """
+        norms = [clip_grad_norm(part, self.max_grad_norm) for part in self._clipped if any(p.grad is not None for p in part)]
+        return norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(norms))
 
     def _updates_left(self) -> float:
         """How many updates will still be made in this call of ``learn``, as the expected number if rounds are episodes."""
@@ -498,4 +511,12 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._log_last_round(check_model=True)  # rolls back instead of saving a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "_objective_options", "objective", "_captured"]
+        return [
+            *super()._excluded_save_params(),
+            "_monitor",
+            "_trained",
+            "_clipped",
+            "_objective_options",
+            "objective",
+            "_captured",
+        ]
