@@ -1,92 +1,18 @@
-"""Hand-written gradients compared with autograd in float64; assigning and clipping compared with PyTorch's functions."""
-
-from copy import deepcopy
+"""Where gradients meet, and assigning and clipping them, compared with autograd and with PyTorch's functions."""
 
 import pytest
 import torch as th
 from torch import nn
-from torch.nn import functional as F
 
-from sb3_eqr.common.groups import MatrixLieGroup, make_group
-from sb3_eqr.common.latent.gradients import assign_gradients, branch, clip_grad_norm
-from sb3_eqr.common.latent.rollout import HiddenLayer, rollout
-from sb3_eqr.common.losses import normalized_distance
+from sb3_eqr.common.latent.gradients import branch
 from sb3_eqr.common.networks.layers import NoisyLinear, draw_noise
-
-AFFINE = MatrixLieGroup([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]]])
-GROUPS = ["GL(2)", "SE(2)", "SE(3)", "SO(2)", "SO(3)", "T(2)", "none(4)", "SE(2)^2 x SO(3)", AFFINE]
-GROUPS += [make_group("SE(2)", "exp"), make_group("SO(2)", "exp"), make_group("SE(2)", "gram-schmidt")]
+from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm
 
 
 def same(found, expected):
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
         th.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
-
-
-def running_statistics(module):
-    return [b for b in module.buffers() if b.is_floating_point()]
-
-
-@pytest.mark.parametrize("name", GROUPS, ids=str)
-def test_vector_jacobian_products_match_element_and_compose(name):
-    group = make_group(name)
-    th.manual_seed(0)
-    params = th.randn(5, 3, group.num_params, dtype=th.float64, requires_grad=True)
-    right = group.element(th.randn(5, 3, group.num_params, dtype=th.float64)).requires_grad_()
-    expected = group.compose(group.element(params), right)
-    gradient = th.randn_like(expected)
-    with th.no_grad():
-        moved, pull_back = group.act_vjp(params, right)
-        found = pull_back(gradient)
-    same([moved], [expected])
-    same(found, th.autograd.grad(expected, [params, right], gradient, materialize_grads=True))
-    if group.num_params < 10:
-        assert th.autograd.gradcheck(group.element, params.detach()[:1, :1].requires_grad_())
-
-
-@pytest.mark.parametrize("training", [True, False], ids=["train", "eval"])
-@pytest.mark.parametrize("norm", ["layer", "batch"])
-@pytest.mark.parametrize("name", GROUPS, ids=str)
-def test_rollout_equals_single_steps(name, norm, training):
-    """Compared with the plain modules on states and one-hot actions and the group's operations, under autograd."""
-    group = make_group(name).for_actions
-    th.manual_seed(0)
-    n_blocks, n_actions, n_steps = 3, 4, 3
-    blocks = group.element(th.randn(6, n_blocks, group.num_params, dtype=th.float64))
-    state = blocks.flatten(1).requires_grad_()
-    kappa = HiddenLayer(state.shape[1] + n_actions, 8, n_blocks * group.num_params, norm).double().train(training)
-    plain = nn.Sequential(*deepcopy(kappa))
-    actions = th.randint(n_actions, (6, n_steps))
-
-    expected = [state]
-    for m in range(n_steps):
-        params = plain(th.cat([expected[-1], F.one_hot(actions[:, m], n_actions)], dim=1))
-        elements = group.element(params.view(6, n_blocks, group.num_params))
-        expected.append(group.compose(elements, expected[-1].view(blocks.shape)).flatten(1))
-    expected = th.stack(expected[1:], dim=1)
-    found = rollout(group, state, actions, kappa)
-    weights = th.randn_like(found)
-    same([found], [expected])
-    gradients = [
-        th.autograd.grad((x * weights).sum(), [state, *k.parameters()]) for x, k in ((found, kappa), (expected, plain))
-    ]
-    same(*gradients)
-    same(running_statistics(kappa), running_statistics(plain))
-
-
-@pytest.mark.parametrize("training", [True, False], ids=["train", "eval"])
-@pytest.mark.parametrize("norm", ["layer", "batch"])
-def test_hidden_layer_equals_its_modules(norm, training):
-    th.manual_seed(0)
-    layer = HiddenLayer(5, 7, 3, norm).double().train(training)
-    plain = nn.Sequential(*deepcopy(layer))
-    inputs = th.randn(6, 5, dtype=th.float64, requires_grad=True)
-    found, expected = layer(inputs), plain(inputs)
-    weights = th.randn_like(found)
-    same([found], [expected])
-    same(*[th.autograd.grad((x * weights).sum(), [inputs, *k.parameters()]) for x, k in ((found, layer), (expected, plain))])
-    same(running_statistics(layer), running_statistics(plain))
 
 
 def test_noisy_layer_follows_its_formula():
@@ -100,19 +26,6 @@ def test_noisy_layer_follows_its_formula():
     weights = th.randn_like(found)
     same([found], [expected])
     same(*[th.autograd.grad((x * weights).sum(), [inputs, *layer.parameters()]) for x in (found, expected)])
-
-
-@pytest.mark.parametrize("target_is_trained", [True, False])
-def test_distance_of_directions(target_is_trained):
-    th.manual_seed(0)
-    prediction = th.randn(4, 3, 5, dtype=th.float64, requires_grad=True)
-    target = th.randn(4, 3, 5, dtype=th.float64, requires_grad=target_is_trained)
-    found = normalized_distance(prediction, target)
-    expected = (F.normalize(prediction, dim=-1) - F.normalize(target, dim=-1)).square().sum(dim=-1)
-    weights = th.randn_like(found)
-    same([found], [expected])
-    inputs = [prediction, target] if target_is_trained else [prediction]
-    same(*[th.autograd.grad((x * weights).sum(), inputs) for x in (found, expected)])
 
 
 def test_assigned_gradients_equal_those_of_backward():

@@ -4,8 +4,9 @@ import torch as th
 from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
-from sb3_eqr.common.networks.encoders import ConvTrunk, GroupLayer
-from sb3_eqr.common.networks.layers import Centering, DistributionalHead, NoisyLinear, Whitening, draw_noise
+from sb3_eqr.common.groups import GroupLayer, Whitening
+from sb3_eqr.common.networks.encoders import ConvTrunk
+from sb3_eqr.common.networks.layers import Centering, DistributionalHead, NoisyLinear, draw_noise
 
 
 def test_noise_is_factorised_and_redrawn():
@@ -69,13 +70,6 @@ def test_dueling_by_hand(net_arch):
     for action in range(3):
         expected = value + advantage[:, :, action] - (advantage[:, :, 0] + advantage[:, :, 1] + advantage[:, :, 2]) / 3
         th.testing.assert_close(found[:, :, action], expected)
-
-
-def test_projection_is_the_first_layer_without_noise():
-    head = DistributionalHead(2, 3, 4, [8], nn.ReLU, dueling=True, sigma_init=0.5)
-    features = th.randn(5, 2)
-    assert th.equal(head.project(features), nn.functional.linear(features, head.first[0].weight, head.first[0].bias))
-    assert head.project(features).shape == (5, 16)
 
 
 def test_conv_trunk_is_the_network_of_mnih_et_al_2015():
