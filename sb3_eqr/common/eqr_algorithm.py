@@ -127,8 +127,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param exploration_initial_eps: initial value of random action probability; above 1: all actions are random until it
             falls below 1
         :param exploration_final_eps: final value of random action probability
-        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), of the network with its Q head
-            and of the latent model, each
+        :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), for the network with its Q
+            head and for the latent model apart
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 disables it
@@ -385,8 +385,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     def _clip_gradients(self) -> th.Tensor:
         """
-        Clip the gradients of the network and those of the latent model, each to ``max_grad_norm``: that of the reward loss grows
-        with the square of the rewards, that of Q-learning in proportion, so that one clip would leave nothing of Q-learning.
+        Clip the gradients of the network and those of the latent model, each to ``max_grad_norm``. That of the reward loss
+        grows with the square of the rewards, that of Q-learning in proportion: one clip would leave nothing of Q-learning.
 
         :return: the norm of all gradients before clipping, ()
         """
