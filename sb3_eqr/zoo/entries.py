@@ -93,9 +93,9 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
     :param entries: entries of a file
     :param env_id: the environment
     :param changes: changes of the entry, which may wrap the environment
-    :return: its own name, "atari", or that of a generic entry: "default", or "default-image" or "default-small-image" if
-        the file has them and the observations are images (RL Zoo itself knows only "default"); exits with a message if the
-        environment cannot be made
+    :return: its own name, "atari", or that of a generic entry: "default", or "default-image", "default-small-image" or
+        "default-dict" if the file has them and the observations are images or dicts (RL Zoo itself knows only "default");
+        exits with a message if the environment cannot be made
     """
     if env_id in entries:
         return env_id
@@ -110,6 +110,8 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
     except (ValueError, TypeError, ImportError, AttributeError) as error:
         fail(f"{env_id}: {error}")
     env.close()
+    if isinstance(space, gym.spaces.Dict):
+        return "default-dict"
     if not is_image_space(space):
         return "default"
     return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_IMAGE else "default-image"

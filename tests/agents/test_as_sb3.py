@@ -14,9 +14,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch.nn import functional as F
 
-from sb3_eqr import GroupFeaturesExtractor
+from sb3_eqr import EqRRainbow, GroupFeaturesExtractor
 from tests.models import EITHER, MAKERS
-from tests.toys import ChainEnv, ImageEnv
+from tests.toys import ChainEnv, DictEnv, ImageEnv
 
 
 def continued(model):
@@ -126,16 +126,17 @@ def test_the_group_encoder_passes_features_dim_to_its_trunk():
 def test_dicts_may_hold_small_images(make):
     space = spaces.Dict({"image": spaces.Box(0, 255, (3, 10, 10), np.uint8), "place": spaces.Box(-1, 1, (3,), np.float32)})
     env = TransformObservation(ChainEnv(), lambda place: {"image": np.full((3, 10, 10), 7, np.uint8), "place": place}, space)
-    network = {"features_extractor_kwargs": {"layers": [[16, 3, 1]], "cnn_output_dim": 24}}
+    network = {"features_extractor_kwargs": {"cnn_output_dim": 24}}
     trunk = trunk_of(make(env, "MultiInputPolicy", policy_kwargs=network, shift_pixels=0).learn(50))
     observations = {"image": th.rand(2, 3, 10, 10), "place": th.rand(2, 3)}
-    convolution, linear, mlp = trunk.images["image"].trunk[0], trunk.images["image"].linear[0], trunk.mlp[0]
+    convolution, linear, mlp = trunk.images[0].trunk[0], trunk.images[0].linear[0], trunk.mlp[0]
     patches = F.unfold(observations["image"], 3)  # (2, 27, 64): the convolution as a product of matrices
     maps = (convolution.weight.flatten(1) @ patches + convolution.bias[:, None]).relu().flatten(1)
     parts = [maps @ linear.weight.T + linear.bias, observations["place"] @ mlp.weight.T + mlp.bias]
     th.testing.assert_close(trunk(observations), th.cat(parts, dim=1).relu())
-    with pytest.raises(ValueError, match="at least 36x36"):
-        make(env, "MultiInputPolicy")
+    network["features_extractor_kwargs"]["layers"] = [[32, 8, 4], [64, 4, 2]]
+    with pytest.raises(ValueError, match="at least 20x20"):
+        make(env, "MultiInputPolicy", policy_kwargs=network)
 
 
 @pytest.mark.parametrize(
@@ -189,3 +190,24 @@ def test_old_import_paths():
         "make_group": make_group,
     }.items():
         assert getattr(sb3_eqr, name) is found
+
+
+@EITHER
+def test_any_key_and_any_size_of_image_in_a_dict(make):
+    """SB3's extractor fails for these keys, and for images smaller than 36×36."""
+    env = DictEnv(("keys", "items", "a.b", "type"))
+    env.observation_space.spaces["board"] = spaces.Box(0, 255, (7, 7, 3), np.uint8)
+    env.observe = lambda: {key: space.sample() for key, space in env.observation_space.items()}
+    model = make(env, "MultiInputPolicy").learn(50)
+    assert model._n_updates > 0 and trunk_of(model).image_keys == ["board"]
+
+
+@pytest.mark.parametrize("space", [spaces.Text(9), spaces.Sequence(spaces.Discrete(2)), spaces.Tuple([spaces.Discrete(2)])])
+def test_spaces_without_a_shape_are_refused_by_name(space):
+    env = DictEnv()
+    env.observation_space.spaces["mission"] = space
+    with pytest.raises(ValueError, match=r"observation_space\['mission'\] must be a Box, .* or a Dict of these, got "):
+        EqRRainbow("MultiInputPolicy", env)
+    env.observation_space = space
+    with pytest.raises(ValueError, match=r"observation_space must be a Box, .* or a Dict of these, got "):
+        EqRRainbow("MlpPolicy", env)

@@ -26,7 +26,7 @@ from sb3_eqr.trust import read_plain
 from sb3_eqr.zoo.__main__ import find_hyperparameters, main
 from sb3_eqr.zoo.entries import entry_name
 from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
-from tests.toys import ChainEnv, ImageEnv
+from tests.toys import ChainEnv, DictEnv, ImageEnv
 
 
 @pytest.fixture
@@ -182,6 +182,7 @@ def test_options_can_be_abbreviated_as_in_rl_zoo(sb3_eqr, capfd, tmp_path):
         ("FrozenLake-v1", "default", "MlpPolicy"),
         ("SlidingBall-v0", "default-image", "CnnPolicy"),
         ("SmallImages-v0", "default-small-image", "CnnPolicy"),
+        ("Dicts-v0", "default-dict", "MultiInputPolicy"),
     ],
 )
 def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
@@ -190,6 +191,9 @@ def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     monkeypatch.setitem(gym.registry, "SmallImages-v0", gym.spec("CartPole-v1"))  # so that it is removed at the end
     gym.registry.pop("SmallImages-v0")
     gym.register("SmallImages-v0", lambda: ImageEnv((10, 10, 3)))
+    monkeypatch.setitem(gym.registry, "Dicts-v0", gym.spec("CartPole-v1"))
+    gym.registry.pop("Dicts-v0")
+    gym.register("Dicts-v0", lambda: gym.wrappers.TimeLimit(DictEnv(), 30))
     out = sb3_eqr(f"train --algo {algo} --env {env_id} -n 90 -params learning_starts:40 --eval-freq -1 -f {tmp_path}")
     assert (f"Using the entry {name!r}" in out) == (name != "default")
     folder = tmp_path / algo / f"{env_id}_1"

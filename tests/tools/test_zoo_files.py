@@ -22,7 +22,7 @@ ENVIRONMENTS = {
     *(f"MinAtar/{game}-v1" for game in GAMES),
 }
 ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
-GENERIC = {"default", "default-image", "default-small-image"}  # test_zoo.py trains by them
+GENERIC = {"default", "default-image", "default-small-image", "default-dict"}  # test_zoo.py trains by them
 CASES = [  # an entry shared by several environments is one YAML object and built once
     (name, env_id)
     for name, entries in ENTRIES.items()

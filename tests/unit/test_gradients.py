@@ -1,11 +1,10 @@
-"""Where gradients meet, and assigning and clipping them, compared with autograd and with PyTorch's functions."""
+"""Where gradients meet, compared with autograd; assigning and clipping them, compared with PyTorch's functions."""
 
 import pytest
 import torch as th
 from torch import nn
 
 from sb3_eqr.common.latent.gradients import branch
-from sb3_eqr.common.networks.layers import NoisyLinear, draw_noise
 from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm
 
 
@@ -13,19 +12,6 @@ def same(found, expected):
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
         th.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
-
-
-def test_noisy_layer_follows_its_formula():
-    th.manual_seed(0)
-    layer = NoisyLinear(5, 3).double()
-    ((noise_out, noise_in),) = draw_noise([layer])
-    inputs = th.randn(6, 5, dtype=th.float64, requires_grad=True)
-    found = layer(inputs, (noise_out, noise_in))
-    weight = layer.weight + layer.weight_sigma * noise_out[:, None] * noise_in
-    expected = inputs @ weight.T + layer.bias + layer.bias_sigma * noise_out
-    weights = th.randn_like(found)
-    same([found], [expected])
-    same(*[th.autograd.grad((x * weights).sum(), [inputs, *layer.parameters()]) for x in (found, expected)])
 
 
 def test_assigned_gradients_equal_those_of_backward():

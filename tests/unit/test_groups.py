@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_eqr.common.groups import (
-    GL,
-    SO,
-    MatrixLieGroup,
-    ProductGroup,
-    T,
-    guarded_inverse,
-    make_group,
-)
+from sb3_eqr.common.groups import SO, MatrixLieGroup, T, guarded_inverse, make_group
 from sb3_eqr.common.groups.matrix import euler_rotation, exp_rotation
 from sb3_eqr.common.saving.plain_data import encode
 
@@ -29,22 +21,14 @@ IDS = [f"{name}-{parameterization}" for name, parameterization in GROUPS]
 
 
 def random_elements(group, *batch, seed=0):
+    return group.element(random_params(group, *batch, seed=seed))
+
+
+def random_params(group, *batch, seed=0):
+    """Those of GL are near a multiple of the identity, so that the matrices are well conditioned."""
     generator = th.Generator().manual_seed(seed)
     params = th.randn(*batch, group.num_params, generator=generator, dtype=th.float64)
-    if "GL" in group.name:  # shift each matrix of the GL blocks towards the identity, so that it is well conditioned
-        params = params + 4 * group_identity_params(group)
-    return group.element(params)
-
-
-def group_identity_params(group):
-    if isinstance(group, GL):
-        return th.eye(group.element_shape[0], dtype=th.float64).flatten()
-    factors = group.factors if isinstance(group, ProductGroup) else []
-    pieces = [
-        group_identity_params(g).repeat(n) if isinstance(g, GL) else th.zeros(n * g.num_params, dtype=th.float64)
-        for g, n in factors
-    ]
-    return th.cat(pieces)
+    return params + 4 * group.identity_params()
 
 
 @pytest.mark.parametrize("name, parameterization", GROUPS, ids=IDS)
@@ -67,19 +51,12 @@ def test_axioms(name, parameterization):
 @pytest.mark.parametrize("name, parameterization", GROUPS, ids=IDS)
 def test_gradients(name, parameterization):
     group = make_group(name, parameterization)
-    params = [random_params(group, seed) for seed in (0, 1)]
+    params = [random_params(group, 1, seed=seed).requires_grad_() for seed in (0, 1)]
 
     def function(p, q):
         return group.compose(group.element(p), group.inverse(group.element(q)))
 
     assert th.autograd.gradcheck(function, params, fast_mode=group.num_params > 9)  # along random directions
-
-
-def random_params(group, seed):
-    params = th.randn(1, group.num_params, generator=th.Generator().manual_seed(seed), dtype=th.float64)
-    if "GL" in group.name:
-        params = params + 4 * group_identity_params(group)
-    return params.requires_grad_()
 
 
 @pytest.mark.parametrize("n", [2, 3, 6])

@@ -9,24 +9,18 @@ from sb3_eqr.common.networks.encoders import ConvTrunk
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead, NoisyLinear, draw_noise
 
 
-def test_noise_is_factorised_and_redrawn():
+@pytest.mark.parametrize("batch", [NoisyLinear.SMALL_BATCH - 1, NoisyLinear.SMALL_BATCH])
+def test_noisy_layer_by_its_formula(batch):
+    """y = (μ_w + σ_w ⊙ f(ε_out) f(ε_in)ᵀ) x + μ_b + σ_b ⊙ f(ε_out), in both ways of computing it."""
     th.manual_seed(0)
-    layer = NoisyLinear(6, 5, sigma_init=0.5)
-    eye = th.eye(6)  # rows of weights: W e_k + b
-    clean = layer(eye)
-    assert th.equal(clean, nn.functional.linear(eye, layer.weight, layer.bias))
-    assert th.equal(clean, layer(eye))
-    zero = th.zeros(1, 6)
-    draws = []
-    for _ in range(3):
-        (noise,) = draw_noise([layer])
-        noisy = layer(eye, noise) - clean
-        bias_noise = layer(zero, noise) - layer(zero)  # the noise of the bias alone
-        weight_noise = (noisy - bias_noise).T / layer.weight_sigma  # f(ε_out) f(ε_in)ᵀ
-        singular = th.linalg.svdvals(weight_noise)
-        assert singular[1] < 1e-5 * singular[0]
-        draws.append(noisy)
-    assert not th.allclose(draws[0], draws[1]) and not th.allclose(draws[1], draws[2])
+    layer, inputs = NoisyLinear(6, 5).double().requires_grad_(False), th.randn(batch, 6, dtype=th.float64)
+    layer.weight_sigma.uniform_(), layer.bias_sigma.uniform_()
+    (noise,), (other,) = draw_noise([layer]), draw_noise([layer])
+    assert not th.equal(noise[0], other[0]) and not th.equal(noise[1], other[1])
+    weight = layer.weight.numpy() + layer.weight_sigma.numpy() * np.outer(*noise)
+    bias = layer.bias + layer.bias_sigma * noise[0]
+    np.testing.assert_allclose(layer(inputs, noise), inputs.numpy() @ weight.T + bias.numpy(), atol=1e-12)
+    np.testing.assert_allclose(layer(inputs), inputs.numpy() @ layer.weight.numpy().T + layer.bias.numpy(), atol=1e-12)
 
 
 def test_noise_does_not_depend_on_train_mode():

@@ -140,10 +140,19 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 
 def check_observation_space(observation_space: spaces.Space, name: str = "observation_space") -> None:
-    """Raise ValueError if it, or a space in a dict, has no axis, or is Discrete or MultiDiscrete and does not start at 0."""
-    if isinstance(observation_space, spaces.Dict):
+    """
+    Raise ValueError if it, or a space in a dict, is of a kind without a fixed shape, has no axis, or is Discrete or
+    MultiDiscrete and does not start at 0.
+    """
+    if isinstance(observation_space, spaces.Dict) and name == "observation_space":
         for key, space in observation_space.spaces.items():
             check_observation_space(space, f"observation_space[{key!r}]")
+    elif not isinstance(observation_space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+        raise ValueError(
+            f"{name} must be a Box, Discrete, MultiDiscrete or MultiBinary, or a Dict of these, got {observation_space}. "
+            "Wrap the environment, for example with gymnasium.wrappers.FilterObservation to leave keys of a Dict out, with "
+            "FlattenObservation, or, for MiniGrid, with minigrid.wrappers.ImgObsWrapper."
+        )
     if isinstance(observation_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(observation_space.start != 0):
         raise ValueError(
             f"{name} must start at 0, because SB3 encodes it as one-hot, got {observation_space}. "

@@ -21,6 +21,7 @@ from sb3_eqr.common.networks.layers import Centering
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 NATURE_LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # Mnih et al. 2015, and appendix B.4
+SMALL_LAYERS = ((16, 3, 1),)  # MinAtar (Young and Tian 2019, https://arxiv.org/abs/1903.03176), whose images are 10×10
 
 
 class ConvTrunk(nn.Sequential):
@@ -221,7 +222,8 @@ class DictExtractor(BaseFeaturesExtractor):
     :param observation_space: a ``Dict``
     :param cnn_output_dim: size of the linear layer with a ReLU after the convolutions of each image
     :param normalized_image: as in :class:`ImageExtractor`
-    :param layers: as in :class:`ConvExtractor`, the same for every image
+    :param layers: as in :class:`ConvExtractor`, the same for every image; ``None``: for each image the paper's, or, if it is
+        smaller than 36×36, one layer of 16 filters of 3×3, as for MinAtar
     :param mlp_output_dim: size of the linear layer with a ReLU that takes everything but images, flattened
     :raises ValueError: if an image is too small for the layers
     """
@@ -231,26 +233,31 @@ class DictExtractor(BaseFeaturesExtractor):
         observation_space: spaces.Dict,
         cnn_output_dim: int = 256,
         normalized_image: bool = False,
-        layers: Sequence[Sequence[int]] = NATURE_LAYERS,
+        layers: Sequence[Sequence[int]] | None = None,
         mlp_output_dim: int = 256,
     ):
         check("mlp_output_dim", mlp_output_dim, integer(1))
         images, others = {}, {}
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
-                images[key] = ConvExtractor(space, cnn_output_dim, normalized_image, layers)  # type: ignore[arg-type]
+                is_small = min(space.shape[-2:]) < ConvTrunk.smallest_image()  # type: ignore[index]
+                chosen = layers or (SMALL_LAYERS if is_small else NATURE_LAYERS)
+                images[key] = ConvExtractor(space, cnn_output_dim, normalized_image, chosen)  # type: ignore[arg-type]
             else:
                 others[key] = FlattenExtractor(space)
         super().__init__(observation_space, cnn_output_dim * len(images) + mlp_output_dim * bool(others))
-        self.images, self.others = nn.ModuleDict(images), nn.ModuleDict(others)
+        # Lists, because a ModuleDict refuses keys such as "items" and "a.b".
+        self.image_keys, self.images = list(images), nn.ModuleList(images.values())
+        self.other_keys, self.others = list(others), nn.ModuleList(others.values())
         n_numbers = sum(flat.features_dim for flat in others.values())
         self.mlp = nn.Sequential(nn.Linear(n_numbers, mlp_output_dim), nn.ReLU()) if others else None
 
     def forward(self, observations: TensorDict) -> th.Tensor:
         """Map a dict of (B, ...) to (B, features_dim)."""
-        features = [extractor(observations[key]) for key, extractor in self.images.items()]
+        features = [extractor(observations[key]) for key, extractor in zip(self.image_keys, self.images, strict=True)]
         if self.mlp is not None:
-            features.append(self.mlp(th.cat([flat(observations[key]) for key, flat in self.others.items()], dim=1)))
+            numbers = [flat(observations[key]) for key, flat in zip(self.other_keys, self.others, strict=True)]
+            features.append(self.mlp(th.cat(numbers, dim=1)))
         return th.cat(features, dim=1)
 
 
