@@ -103,6 +103,13 @@ def add_resuming(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trust", action="store_true")
 
 
+def without_gym_packages(arguments: list[str]) -> list[str]:
+    """:return: the arguments without --gym-packages and its values"""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+")
+    return parser.parse_known_args(arguments)[1]
+
+
 def prepare_training(args: argparse.Namespace) -> str | None:
     """
     Check all arguments before RL Zoo starts.
@@ -285,6 +292,8 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
         arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
     elif command in LOADING and args.algo is not None:
         check_device(args.device)
+        check_environment(args.env, args.gym_packages)  # imports the packages, for which two commands have no argument
+        arguments = without_gym_packages(arguments)
         downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
         if not downloads:
             check_trained(args)

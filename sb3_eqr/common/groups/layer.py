@@ -24,7 +24,7 @@ class GroupLayer(nn.Module):
         ("SE(2)^8 x SO(3)^4") or is "none"
     :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether to whiten the algebra parameters over the batch
-        (:class:`~sb3_eqr.common.networks.layers.Whitening`): states cannot collapse to a point, and blocks are decorrelated
+        (:class:`~sb3_eqr.common.groups.layer.Whitening`): states cannot collapse to a point, and blocks are decorrelated
     :raises ValueError: if the group is unknown or ``n_blocks`` is below 1
     """
 
