@@ -261,7 +261,7 @@ def explanation(command: str, error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         return f"{command}: {error}.{advice}"
-    if "pass trust=True" in str(error):
+    if "pass trust=True" in str(error) or str(error).startswith("observation_space"):
         return f"{command}: {error}"
     if isinstance(error, gym.error.DependencyNotInstalled):
         return str(error)
