@@ -294,7 +294,9 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         validation.check_env(env)
-        validation.check_observation_space(env.observation_space)
+        with validation.environment_errors(0):
+            observation_space = env.observation_space
+        validation.check_observation_space(observation_space)
         with validation.environment_errors(0):
             wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         validation.check_action_space(wrapped.action_space)

@@ -1,6 +1,7 @@
 """What sb3-contrib tests for QRDQN, tested for every EqR agent: training, spaces, modes, callbacks, loggers."""
 
 import re
+from contextlib import nullcontext
 from copy import deepcopy
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import (
     FakeImageEnv,
@@ -530,8 +531,9 @@ def test_terminal_observations_behind_vec_normalize_are_stored_as_they_were(make
     np.testing.assert_allclose(stored, env.last, atol=0 if is_kept else 1e-5)
 
 
-def test_after_a_callback_has_stopped_learn_it_continues_with_a_new_episode(make):
-    """The step at which it stopped is not stored, so the next one does not follow the last one stored."""
+@pytest.mark.parametrize("kind", [None, ValueError, KeyboardInterrupt])
+def test_the_step_at_which_a_callback_stops_learn_is_stored(make, kind):
+    """By its answer or by an exception; the next call of ``learn`` goes on from there."""
 
     class Clock(Drawn):
         def reset(self, *, seed=None, options=None):
@@ -541,13 +543,31 @@ def test_after_a_callback_has_stopped_learn_it_continues_with_a_new_episode(make
         def step(self, action):
             return np.full(1, self.time + 1, np.float32), *super().step(action)[1:]
 
+    def stop(found, _):
+        if kind is not None and found["self"].num_timesteps == 15:
+            raise kind("stop")
+        return found["self"].num_timesteps < 15
+
     model = make(Clock(spaces.Box(0, 10, (1,), np.float32)), learning_starts=1_000)
-    model.learn(100, callback=lambda found, _: found["self"].num_timesteps < 15)
+    with nullcontext() if kind is None else pytest.raises(kind):
+        model.learn(100, callback=stop)
     model.learn(5, reset_num_timesteps=False)
-    buffer, rows = model.replay_buffer, np.arange(19)
+    buffer, rows = model.replay_buffer, np.arange(20)
     now, then = (buffer._stores[""].observations(rows, 0 * rows, following=f)[:, 0].tolist() for f in (False, True))
-    assert now == [*range(10), *range(4), *range(5)] and then == [n + 1 for n in now]
-    assert np.flatnonzero(buffer.timeouts[:19, 0]).tolist() == [9, 13]  # no return crosses the interruption
+    assert now == [*range(10), *range(10)] and then == [n + 1 for n in now]
+    ends = buffer.dones[:20, 0] + buffer.timeouts[:20, 0] > 0
+    assert buffer.pos == 20 and np.flatnonzero(ends).tolist() == [9, 19]
+
+
+@EITHER
+def test_episodes_that_end_the_training_are_counted(make):
+    """``StopTrainingOnMaxEpisodes`` ends twenty calls of ``learn``, each with the last step of an episode."""
+    model = make(ImageEnv(length=5), "CnnPolicy", learning_starts=1_000)
+    for _ in range(20):
+        model.learn(1_000, StopTrainingOnMaxEpisodes(1), reset_num_timesteps=False)
+    ends = model.replay_buffer.dones[:100, 0] + model.replay_buffer.timeouts[:100, 0] > 0
+    assert model.num_timesteps == model.replay_buffer.pos == 100 and np.flatnonzero(ends).tolist() == [*range(4, 100, 5)]
+    assert model._episode_num == len(model.ep_info_buffer) == 20
 
 
 def test_predict_shapes(make):

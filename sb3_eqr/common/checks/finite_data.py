@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -17,10 +18,11 @@ class FiniteData(OffPolicyAlgorithm):
     """
     Mixin that rejects observations, rewards and terminal observations that are NaN or infinite, in training and in
     ``predict``. A rejected step does not change the replay buffer and the statistics of VecNormalize. Terminal observations
-    are stored as the environment returned them, and no stored step follows one that a stop of the training has left out.
+    are stored as the environment returned them, and a stop of the training leaves out no step.
     """
 
     trained_normalized = False  # whether the last environment was wrapped in VecNormalize; saved with the model
+    _stored_steps = 0  # num_timesteps after the last step that was stored
     _statistics: dict[str, Any] | None = None  # VecNormalize's statistics after the last accepted step
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -29,18 +31,39 @@ class FiniteData(OffPolicyAlgorithm):
             result = super()._setup_learn(*args, **kwargs)
         check_finite("observation", self._last_obs, self.num_timesteps)
         self._statistics = statistics_of(self._vec_normalize_env)
+        self._stored_steps = self.num_timesteps
         return result
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
         """
         As SB3's ``collect_rollouts``, with two differences: errors state if an environment violates gymnasium's interface, and
-        after a callback has stopped the training, the next call of ``learn`` resets the environment.
+        the step that a callback saw when it stopped the training, by its answer or by an exception, is stored as all others.
         """
         with environment_errors(self.num_timesteps):
-            result = super().collect_rollouts(*args, **kwargs)
-        if not result.continue_training:
-            self._last_obs = None  # the environment has already stepped, and this step was not stored
+            try:
+                result = super().collect_rollouts(*args, **kwargs)
+            except BaseException:  # Ctrl-C, too
+                self._finish_step(kwargs["callback"])
+                raise
+            if not result.continue_training:
+                self._finish_step(kwargs["callback"])
         return result
+
+    def _finish_step(self, callback: BaseCallback) -> None:
+        """Do what SB3 does after a callback has seen a step, if the training was stopped before that."""
+        if self._stored_steps == self.num_timesteps:
+            return  # the error came before the step, or from the environment
+        self._stored_steps = self.num_timesteps
+        if callback.num_timesteps != self.num_timesteps:
+            self._last_obs = None  # nobody has seen this step, so the next call of learn must reset the environment
+            return
+        seen = callback.locals
+        self._update_info_buffer(seen["infos"], seen["dones"])
+        step = (seen[name] for name in ("replay_buffer", "buffer_actions", "new_obs", "rewards", "dones", "infos"))
+        self._store_transition(*step)
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        self._on_step()
+        self._episode_num += int(seen["dones"].sum())
 
     def _warn_without_normalization(self) -> None:
         """Warn if an agent trained with VecNormalize would now get raw observations, with which its actions are useless."""
@@ -67,6 +90,7 @@ class FiniteData(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        self._stored_steps = self.num_timesteps
         # Check the original values, because VecNormalize's clipping may hide an infinity.
         normalize, step = self._vec_normalize_env, self.num_timesteps
         try:
@@ -129,7 +153,7 @@ class FiniteData(OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_statistics"]
+        return [*super()._excluded_save_params(), "_statistics", "_stored_steps"]
 
 
 def original_infos(normalize: VecNormalize | None) -> list[dict[str, Any]]:
