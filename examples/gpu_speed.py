@@ -23,8 +23,8 @@ import torch as th
 from stable_baselines3.common.logger import configure
 from torch.utils.benchmark import timer
 
-from benchmarks.clock import Table, median, take_turns
-from benchmarks.workload import EQR_AGENTS, Floor, fill, make_agent
+from experiments.clock import Table, median, take_turns
+from experiments.workload import EQR_AGENTS, Floor, fill, make_agent
 from sb3_eqr import EqRRainbow
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.envs import make_atari100k_env

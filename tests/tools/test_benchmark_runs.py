@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from benchmarks import packed_runs
+from experiments import packed_runs
 from sb3_eqr.benchmark import runs, training
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env

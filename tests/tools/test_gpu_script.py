@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 import torch as th
 
-from benchmarks import atari_on_gpu
-from benchmarks.atari_on_gpu import table
-from benchmarks.workload import EQR_AGENTS
+from experiments import atari_on_gpu
+from experiments.atari_on_gpu import table
+from experiments.workload import EQR_AGENTS
 from tests.tools.test_package import ROOT
 
 NO_GPU = "a CUDA graph needs a GPU, and the device is 'cpu'"
@@ -101,7 +101,7 @@ def test_several_runs_write_one_file(tmp_path):
         "-W",
         "ignore",
         "-m",
-        "benchmarks.atari_on_gpu",
+        "experiments.atari_on_gpu",
         str(tmp_path / "rows.jsonl"),
         "--device",
         "cpu",

@@ -3,7 +3,7 @@
 import pytest
 from scipy.stats import t
 
-from benchmarks.per_game import final_scores, table
+from experiments.per_game import final_scores, table
 
 
 def result(agent, game, seed, *scores):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.published_rows import disagreements, human_normalized, last_rows, published_table
+from experiments.published_rows import disagreements, human_normalized, last_rows, published_table
 from sb3_eqr.benchmark.reference import load_reference, match_games
 from sb3_eqr.benchmark.scores import read_runs
 from tests.tools.test_package import ROOT
