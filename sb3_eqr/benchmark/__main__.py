@@ -27,12 +27,18 @@ def make_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")
     run.add_argument("--games", nargs="+", help="a subset of the suite's games (default: all)")
-    run.add_argument("--seeds", type=int, help=f"number of seeds, counted from 0 (default: {SEEDS})")
+    run.add_argument("--seeds", help=f"number of seeds, or the seeds themselves, such as 1,3 (default: {SEEDS})")
+    run.add_argument("--first-seed", type=int, default=0, help="where the number of seeds counts from (default: 0)")
     run.add_argument("--steps", type=int, help="training steps instead of the suite's")
-    run.add_argument("--device", default="auto", help="PyTorch device (default: the GPU with --gpus-per-run, else cpu)")
-    run.add_argument("--address", help="address of a Ray cluster that can access the folder (default: this machine)")
+    run.add_argument("--episodes", type=int, help="episodes of the final evaluation instead of the suite's")
+    run.add_argument("--device", default="auto", help="PyTorch device (default: cpu)")
+    run.add_argument("--jobs", type=int, help="runs at once (default: the cores divided by --cpus-per-run)")
     run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs and PyTorch threads per run (default: 1)")
-    run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs per run, such as 0.1 (default: 0)")
+    run.add_argument("--stop-after", type=float, metavar="SECONDS", help="then checkpoint and stop; the same command continues")
+    run.add_argument(
+        "--ray", nargs="?", const="local", metavar="ADDRESS", help="run on Ray: on the cluster at ADDRESS, or on this machine"
+    )
+    run.add_argument("--gpus-per-run", type=float, default=0.0, help="with --ray: GPUs per run, such as 0.1 (default: 0)")
     run.add_argument("--save-models", action="store_true", help="save each trained agent in models/ of its run, for enjoy -f")
     run.add_argument(
         "--checkpoint-every",

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import pathlib
+import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
@@ -17,6 +19,7 @@ from sb3_eqr.zoo import register
 
 SUITE = "suite.yml"  # in the folder of the benchmark
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # in that of a run
+STOPPED = "stopped.json"  # the row of a run that was stopped before its end; its checkpoint is next to it
 MODELS = "models"  # RL Zoo's log folder of a run
 STARTS = "starts.txt"  # a line for each time that a run starts or resumes
 
@@ -30,6 +33,7 @@ class Settings(Strict):
     :param checkpoint_seconds: seconds between checkpoints
     :param gym_packages: packages that register environments
     :param save_models: whether to save trained agents in the format of RL Zoo
+    :param stop_at: when to stop, in seconds since the epoch; ``None``: never
     """
 
     device: str = "auto"
@@ -37,6 +41,11 @@ class Settings(Strict):
     checkpoint_seconds: float = 300.0
     gym_packages: list[str] = []
     save_models: bool = False
+    stop_at: float | None = None
+
+    def is_over(self) -> bool:
+        """:return: whether the time to stop has passed"""
+        return self.stop_at is not None and time.time() >= self.stop_at
 
 
 class State(NamedTuple):
@@ -136,7 +145,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
         file.write(to_json(value).encode())
 
 
-def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int, command: str = "") -> list[Run]:
+def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], seeds: Sequence[int], command: str = "") -> list[Run]:
     """
     Plan the runs of a benchmark, without writing anything. The seed is the outermost loop, so that an interrupted benchmark
     has complete tables of fewer seeds.
@@ -144,12 +153,10 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
     :param folder: folder of the benchmark
     :param suite: the suite
     :param agents: agents as given by the user
-    :param n_seeds: number of seeds, counted from 0
+    :param seeds: the seeds
     :param command: the command of the user
     :raises ValueError: for two agents of the same name, or for runs that exist with other settings
     """
-    if n_seeds < 1:
-        raise ValueError(f"--seeds must be >= 1, got {n_seeds}.")
     found = [find_agent(text) for text in agents]
     names = [agent.name for agent in found]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -160,13 +167,13 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
         action_space = check_game(protocol)
         for agent in found:
             entry = hyperparameters(agent, protocol, action_space)
-            for seed in range(n_seeds):
+            for seed in seeds:
                 place = folder / "runs" / agent.name.replace(":", "-") / game.replace("/", "-") / str(seed)
                 unnamed = defaults(agent, entry)
                 runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command, unnamed))
     for run in runs:
         _check_plan(run)
-    return sorted(runs, key=lambda run: run.seed)
+    return sorted(runs, key=lambda run: seeds.index(run.seed))
 
 
 def with_present_defaults(runs: list[Run]) -> list[Run]:
