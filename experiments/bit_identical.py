@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.logger import configure
@@ -42,7 +43,6 @@ COMMON: dict[str, Any] = {
     "seed": 7,
 }
 NETWORK = {"n_blocks": 3, "net_arch": [32], "latent_hidden_dim": 24}
-OFF = {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
 SCALES = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
 
 
@@ -66,90 +66,10 @@ def make_env(kind: str, n_envs: int) -> VecEnv:
 
 POLICIES = {"vectors": "MlpPolicy", "normalized": "MlpPolicy", "images": "CnnPolicy", "dicts": "MultiInputPolicy"}
 
-# name -> agent, kind of observations, number of environments, arguments, policy_kwargs
-Configuration = tuple[str, str, int, dict[str, Any], dict[str, Any]]
-CONFIGURATIONS: dict[str, Configuration] = {
-    "vectors, qrdqn": ("qrdqn", "vectors", 1, {}, {}),
-    "vectors, rainbow": ("rainbow", "vectors", 1, {}, {}),
-    "images, qrdqn": ("qrdqn", "images", 1, {}, {}),
-    "images, rainbow": ("rainbow", "images", 1, {}, {}),
-    "dicts, qrdqn": ("qrdqn", "dicts", 1, {}, {}),
-    "dicts, rainbow": ("rainbow", "dicts", 1, {}, {}),
-    "three environments, qrdqn": ("qrdqn", "vectors", 3, {}, {}),
-    "three environments, rainbow": ("rainbow", "images", 3, {}, {}),
-    "normalised": ("rainbow", "normalized", 2, {}, {}),
-    "GL(2)": ("qrdqn", "vectors", 1, {}, {"group": "GL(2)"}),
-    "T(2)": ("rainbow", "vectors", 1, {}, {"group": "T(2)"}),
-    "SE(3) by exp": ("qrdqn", "vectors", 1, {}, {"group": "SE(3)", "parameterization": "exp"}),
-    "product": ("rainbow", "vectors", 1, {}, {"group": "SE(2)^2 x SO(3)^2", "n_blocks": None}),
-    "generators": ("qrdqn", "vectors", 1, {}, {"group": SCALES}),
-    "free vectors": ("rainbow", "images", 1, {"symmetry_coef": 0.0}, {"group": "none", "n_blocks": None}),
-    "no encoder": ("qrdqn", "images", 1, {"symmetry_coef": 0.0}, {"group": None, "n_blocks": None}),
-    "no losses": ("rainbow", "vectors", 1, OFF, {}),
-    "depth 0, no encoder": ("qrdqn", "images", 1, {"prediction_depth": 0}, {"group": None, "n_blocks": None}),
-    "AET alone": ("qrdqn", "vectors", 1, {"symmetry_coef": 0.0, "reward_coef": 0.0}, {}),
-    "GET alone": ("rainbow", "vectors", 1, {"aet_coef": 0.0, "reward_coef": 0.0}, {}),
-    "reward alone": ("qrdqn", "images", 1, {"aet_coef": 0.0, "symmetry_coef": 0.0}, {}),
-    "signs of rewards": ("rainbow", "vectors", 1, {"aet_coef": 0.3}, {"reward_loss": "categorical"}),
-    "paper's network": (
-        "qrdqn",
-        "images",
-        1,
-        {"aux_gradient_share": None},
-        {"projection": "head", "head_input": "state", "layer_norm": False, "latent_tau": None},
-    ),
-    "representation alone": (
-        "qrdqn",
-        "images",
-        1,
-        {"td_coef": 0.0, "reward_coef": 0.0, "prioritized_replay": False},
-        {
-            "aet_loss": "contrastive",
-            "whiten": True,
-            "parameterization": "gram-schmidt",
-            "state_dependent_actions": False,
-            "projection": "none",
-            "noisy": False,
-            "dueling": False,
-            "group": "SO(2)",
-        },
-    ),
-    "whitened, contrastive": ("rainbow", "vectors", 1, {}, {"aet_loss": "contrastive", "whiten": True}),
-    "plain head": (
-        "rainbow",
-        "vectors",
-        1,
-        {"double_q": False, "prioritized_replay": False, "intensity_scale": 0.0, "shift_pixels": 0},
-        {"noisy": False, "dueling": False},
-    ),
-    "late target": ("qrdqn", "images", 2, {"target_update_interval": 40, "max_grad_norm": None, "train_freq": 4}, {}),
-    "resets": (
-        "rainbow",
-        "images",
-        1,
-        {
-            "tau": 0.05,
-            "resets": {
-                "interval": 70,
-                "shrink_factor": 0.4,
-                "initial_n_steps": 6,
-                "initial_gamma": 0.9,
-                "annealing_steps": 50,
-            },
-            "replay_buffer_kwargs": {"alpha": 0.7, "beta": 0.5, "final_beta": 0.5},
-        },
-        {
-            "act_with_target": True,
-            "optimizer_class": "AdamW",
-            "optimizer_kwargs": {"weight_decay": 0.1},
-            "features_extractor_class": "impala",
-            "features_extractor_kwargs": {"width_scale": 0.25, "rescale": True},
-        },
-    ),
-    "no optimiser of ours": ("qrdqn", "vectors", 1, {}, {"optimizer_class": th.optim.RMSprop}),
-    "learned elsewhere, frozen": ("rainbow", "vectors", 1, {}, {}),
-    "saved and continued": ("qrdqn", "normalized", 1, {}, {}),
-}
+CONFIGURATIONS: dict[str, dict[str, Any]] = yaml.safe_load(
+    pathlib.Path(__file__).with_name("settings").joinpath("bit_identical.yml").read_text(encoding="utf-8")
+)
+OBJECTS = {"SCALES": SCALES, "RMSprop": th.optim.RMSprop}  # by their names in the file
 
 
 def train(name: str) -> Any:
@@ -157,8 +77,10 @@ def train(name: str) -> Any:
     :param name: name of a configuration
     :return: its agent after about 200 updates
     """
-    agent, kind, n_envs, arguments, network = CONFIGURATIONS[name]
-    arguments = {**COMMON, **arguments, "policy_kwargs": {**NETWORK, **network}}
+    settings = CONFIGURATIONS[name]
+    agent, kind, n_envs = settings["agent"], settings["env"], settings.get("n_envs", 1)
+    network = {key: OBJECTS.get(str(value), value) for key, value in settings.get("policy_kwargs", {}).items()}
+    arguments = {**COMMON, **settings.get("arguments", {}), "policy_kwargs": {**NETWORK, **network}}
     n_steps = 60 + 100 * n_envs * (4 if "train_freq" in arguments else 1)
 
     def made() -> Any:

@@ -3,26 +3,27 @@ How well the latent state of an agent encodes the objects in a game: the fractio
 linear probe explains, on held-out frames; the same for the trunk's features, and for an untrained agent. The positions are
 from MinAtar's planes, for Atari from the console's memory, and from the environments with a known symmetry themselves.
 
-    python -m experiments.probes --game Breakout --steps 10000 --seeds 0 1
-    python -m experiments.probes --game SpaceInvaders --changes '{policy_kwargs: {aet_loss: contrastive}}'
-    python -m experiments.probes --game ALE/Pong --steps 0
-    python -m experiments.probes --game torus_of_4 --steps 0
-    python -m experiments.probes --game ALE/Breakout --trunks runs/trunks/*.pt
-    python -m experiments.probes --game ALE/Boxing --models runs/atari/runs/*/Boxing/0/models/*/*/*.zip
+    python -m experiments.probes minatar Breakout --steps 10000 --seeds 0 1
+    python -m experiments.probes minatar SpaceInvaders --agent eqr_rainbow:experiments/settings/ablation.yml:contrastive
+    python -m experiments.probes worlds torus_of_4
+    python -m experiments.probes atari100k Boxing --models runs/atari/runs/*/Boxing/0/models/*/*/*.zip
+
+Games and agents are those of the benchmark; ``--models`` probes agents that ``sb3-eqr benchmark run --save-models`` kept.
 """
 
 import argparse
-import json
 import pathlib
+import tempfile
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 
-from experiments.trials import WORLDS, make_agent
-from sb3_eqr import EqRRainbow, GroupFeaturesExtractor, envs
+from sb3_eqr import GroupFeaturesExtractor
+from sb3_eqr.benchmark.runs import Settings, plan_runs
+from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.benchmark.training import build
 from sb3_eqr.visualize.latents import encode, eval_mode
 
 # MinAtar's planes (Young and Tian 2019); targets are the mean position and the number of lit pixels per plane.
@@ -32,9 +33,9 @@ PLANES = {
 }
 # Addresses in the memory of the console (Anand et al. 2019, https://arxiv.org/abs/1906.08226, table of their annotations).
 MEMORY = {
-    "ALE/Pong": {"own paddle: y": 51, "their paddle: y": 50, "ball: x": 49, "ball: y": 54},
-    "ALE/Boxing": {"own: x": 32, "own: y": 34, "their: x": 33, "their: y": 35},
-    "ALE/Breakout": {"paddle: x": 72, "ball: x": 99, "ball: y": 101},
+    "Pong": {"own paddle: y": 51, "their paddle: y": 50, "ball: x": 49, "ball: y": 54},
+    "Boxing": {"own: x": 32, "own: y": 34, "their: x": 33, "their: y": 35},
+    "Breakout": {"paddle: x": 72, "ball: x": 99, "ball: y": 101},
 }
 N_FRAMES, TRAINED_ON, RIDGE = 6_000, 4_500, 100.0
 WAVES = {"sine of angle": np.sin, "cosine of angle": np.cos}
@@ -73,7 +74,7 @@ def explained(inputs: np.ndarray, target: np.ndarray) -> float:
 Frames = tuple[np.ndarray, dict[str, np.ndarray]]  # observations, and object -> position, in random order
 
 
-def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
+def watch(model: Any, env: Any, suite: str, game: str, rng: np.random.Generator) -> Frames:
     """
     Frames of the agent's own episodes, with about a third of its actions random; (N, *obs_shape) and (N,), with NaN where a
     ball is not in play.
@@ -81,14 +82,14 @@ def watch(model: Any, env: Any, game: str, rng: np.random.Generator) -> Frames:
     obs, frames, memory = env.reset(), [], []
     for _ in range(N_FRAMES):
         frames.append(obs[0].copy())
-        if game in MEMORY:
+        if suite != "minatar":
             memory.append(env.envs[0].unwrapped.ale.getRAM())
         action, _ = model.predict(obs, deterministic=True)
         action = rng.integers(0, env.action_space.n, 1) if rng.random() < 0.3 else action
         obs, *_ = env.step(action)
     seen = np.stack(frames)
     order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
-    if game in MEMORY:
+    if suite != "minatar":
         known = {name: np.stack(memory)[:, address].astype(float) for name, address in MEMORY[game].items()}
         if "ball: y" in known:  # 0 while no ball is in play, and x is then the last one or that of no ball
             is_out = known["ball: y"] == 0
@@ -138,11 +139,6 @@ def scattered(env_id: str, env_kwargs: dict[str, Any]) -> Frames:
     return seen, known | ({"velocity": velocities} if is_pendulum else {})
 
 
-def frames(model: Any, env: Any, game: str, seed: int) -> Frames:
-    """Random states of an environment with a known symmetry, or what the agent sees in a game."""
-    return scattered(*WORLDS[game]) if game in WORLDS else watch(model, env, game, np.random.default_rng(seed))
-
-
 def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
     """Print R² as a Markdown table: a row per object, a column per agent and what is probed."""
     columns = [(agent, what) for agent in found for what in found[agent]]
@@ -152,56 +148,40 @@ def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> No
         print(f"| {name} | " + " | ".join(f"{found[agent][what].get(name, np.nan):.2f}" for agent, what in columns) + " |")
 
 
-def probe_saved(game: str, paths: list[str]) -> None:
-    """Probe saved agents, and an untrained one, on the same frames: those of the first agent's episodes."""
-    env: Any = envs.make_atari100k_env(game.removeprefix("ALE/"), n_envs=1, seed=0)
-    models = {path: EqRRainbow.load(path, env, device="cpu", custom_objects={"buffer_size": 100}) for path in paths}
-    frames = watch(models[paths[0]], models[paths[0]].get_env(), game, np.random.default_rng(0))
-    models["untrained"] = EqRRainbow("CnnPolicy", env, seed=0, device="cpu", buffer_size=100)
-    print_table("R²", {name: probe(model, frames) for name, model in models.items()})
-
-
-def probe_trunks(game: str, paths: list[str]) -> None:
-    """Probe saved trunks (``experiments.atari_on_gpu --trunks``) and an untrained one, on frames of an untrained agent."""
-    env: Any = envs.make_atari100k_env(game.removeprefix("ALE/"), n_envs=1, seed=0)
-    model = EqRRainbow("CnnPolicy", env, seed=0, device="cpu", buffer_size=100)
-    frames = watch(model, model.get_env(), game, np.random.default_rng(0))
-    found = {"untrained": probe(model, frames)}
-    for path in paths:
-        trunk(model).load_state_dict(th.load(path, "cpu", weights_only=True))
-        found[pathlib.Path(path).stem] = {"trunk": probe(model, frames)["trunk"]}
-    print_table("R²", found)
+def make(agent: str, suite: str, game: str, seed: int, steps: int) -> Any:
+    """:return: an untrained agent of the benchmark"""
+    with tempfile.TemporaryDirectory() as folder:
+        place = pathlib.Path(folder)
+        (run,) = plan_runs(place, choose(load_suite(suite), [game], max(steps, 1_000)), [agent], [seed])
+        return build(run, Settings(device="cpu"), place / "logs")[0]
 
 
 def main() -> None:
     """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--game", choices=[*PLANES, *MEMORY, *WORLDS], default="Breakout")
-    parser.add_argument("--agent", help="a file of zoo_hyperparams (default: eqr_rainbow; eqr_qrdqn where states are known)")
-    parser.add_argument("--changes", type=yaml.safe_load, default={}, help="changes of its entry, as YAML")
-    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("suite", choices=["minatar", "atari100k", "worlds"])
+    parser.add_argument("game", help=f"{', '.join(PLANES)}; {', '.join(MEMORY)}; or an environment of worlds")
+    parser.add_argument("--agent", help="default: eqr_rainbow, of worlds eqr_qrdqn")
+    parser.add_argument("--steps", type=int, default=0, help="training steps; default: 0, untrained")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--models", nargs="+", help="saved agents for an Atari game, instead of training one")
-    parser.add_argument("--trunks", nargs="+", help="saved trunks for an Atari game, instead of training an agent")
+    parser.add_argument("--models", nargs="+", default=[], help="saved agents, instead of training one")
     args = parser.parse_args()
     th.set_num_threads(1)
-    envs.register()
-    if args.models:
-        probe_saved(args.game, args.models)
-        return
-    if args.trunks:
-        probe_trunks(args.game, args.trunks)
-        return
-    agent = args.agent or ("eqr_qrdqn" if args.game in WORLDS else "eqr_rainbow")
+    agent = args.agent or ("eqr_qrdqn" if args.suite == "worlds" else "eqr_rainbow")
     for seed in args.seeds:
-        model, new = (
-            make_agent(agent, args.game, seed, {**args.changes, "buffer_size": max(args.steps, 100)}) for _ in range(2)
-        )
+        models = {"new": make(agent, args.suite, args.game, seed, args.steps)}
+        for path in args.models:
+            settings = {"device": "cpu", "custom_objects": {"buffer_size": 100}}
+            models[path] = type(models["new"]).load(path, models["new"].get_env(), **settings)
         if args.steps:
-            model.learn(args.steps)
-        seen = frames(model, model.get_env(), args.game, seed)
-        print_table(f"seed {seed}", {"new": probe(new, seen)} | ({"trained": probe(model, seen)} if args.steps else {}))
-        print(json.dumps(args.changes), flush=True)
+            models["trained"] = make(agent, args.suite, args.game, seed, args.steps).learn(args.steps)
+        player = list(models.values())[-1]
+        if args.suite == "worlds":
+            protocol = load_suite("worlds").protocol(args.game)
+            seen = scattered(protocol["env_id"], protocol["preprocessing"].get("env_kwargs", {}))
+        else:
+            seen = watch(player, player.get_env(), args.suite, args.game, np.random.default_rng(seed))
+        print_table(f"seed {seed}", {name: probe(model, seen) for name, model in models.items()})
 
 
 if __name__ == "__main__":

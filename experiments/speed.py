@@ -29,10 +29,22 @@ from torch.utils.benchmark import Timer, timer
 from experiments import workload
 from experiments.clock import Table, count_operations, median, take_turns
 from experiments.sizes import STORED, measure_sizes
-from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, NETWORKS, Floor, bytes_per_transition, make_trainable
+from experiments.workload import (
+    AGENTS,
+    BEFORE,
+    EQR_AGENTS,
+    N_STORED,
+    NETWORKS,
+    Floor,
+    bytes_per_transition,
+    fill,
+    make_agent,
+    make_trainable,
+)
 from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
+TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others: they begin with the backup that is made every 50 updates
 N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
 NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
@@ -153,19 +165,56 @@ def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
         yield Table(f"profile_{name}_{key}", f"Update of {name} by stage and operation, {key}", shown, notes)
 
 
-MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_sizes)
+def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
+    """Updates captured as a CUDA graph: they must differ from eager ones no more than these from their own repetition."""
+    rows: list[dict[str, Any]] = []
+    for name in EQR_AGENTS:
+        agents = []
+        for graph in (False, False, True):
+            agents.append(make_agent(name, device=args.device, cuda_graph=graph))  # which seeds the generators
+            fill(agents[-1].replay_buffer, N_STORED)
+            agents[-1].train(N_BEFORE, agents[-1].batch_size)
+        eager, again, captured = (th.cat([p.detach().flatten() for p in one.policy.parameters()]) for one in agents)
+        apart_again, apart = (again - eager).abs().max().item(), (captured - eager).abs().max().item()
+        failure = agents[2]._captured.failure
+        is_right = apart <= max(TOLERANCE, 2 * apart_again) and (failure is None or args.device == "cpu")
+        floor, n_updates = Floor(agents[0]), NETWORKS["atari"].n_updates
+        calls: dict[str, Callable[[], object]] = {FLOOR: partial(floor.steps, n_updates)}
+        calls |= {
+            way: partial(one.train, n_updates, one.batch_size)
+            for way, one in zip(("eager", "captured"), agents[1:], strict=True)
+        }
+        times = {f"{way}_ms": median(found.ms) for way, found in take_turns(calls, args.rounds, n_updates).items()}
+        rows.append(
+            {
+                "name": name,
+                **times,
+                "eager_again": apart_again,
+                "captured": apart,
+                "capture": failure or "captured",
+                "ok": is_right,
+            }
+        )
+    notes = [
+        f"eager_again, captured: largest difference of a parameter from an eager agent's, {N_BEFORE} updates from one seed"
+    ]
+    yield Table("graph", f"Update as a CUDA graph, atari, {args.device}", rows, notes)
+
+
+MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_graph, measure_sizes)
 PARTS = {measure.__name__.removeprefix("measure_"): measure for measure in MEASURES}
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the given arguments, or else the command line; argparse reports wrong ones."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=__doc__.strip().split("\n")[0])
-    several, all_but_sizes = partial(str.split, sep=","), [part for part in PARTS if part != "sizes"]
-    parser.add_argument("--only", metavar="PARTS", type=several, default=all_but_sizes, help=f"some of {', '.join(PARTS)}")
+    several, usual = partial(str.split, sep=","), [part for part in PARTS if part not in ("sizes", "graph")]
+    parser.add_argument("--only", metavar="PARTS", type=several, default=usual, help=f"some of {', '.join(PARTS)}")
     networks = f"some of {', '.join(NETWORKS)}; default: all, but minatar for profile"
     parser.add_argument("--network", metavar="NETWORKS", type=several, help=networks)
     parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
     parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
+    parser.add_argument("--device", default="cpu", help="of graph: cuda, or cpu to test the script")
     parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured alternately with this one")
     parser.add_argument("--largest", type=int, default=STORED[-1], metavar="N", help="largest buffer of sizes; 7.2 kB each")
     parser.add_argument("--json", metavar="FILE", help="also write all tables to this file")
@@ -203,13 +252,16 @@ def main() -> None:
     about = surroundings(args)
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     print(f"{about['cpu']}, {args.threads} thread(s), {args.rounds} rounds, {versions}")
+    failed = False
     for part in args.only:
         for table in PARTS[part](args):
             print(f"\n{table.text()}", flush=True)
+            failed |= not all(row.get("ok", True) for row in table.rows)
             about["tables"][table.name] = table._asdict()
     if args.json:
         with atomic_write(args.json, "json") as file:
             file.write(json.dumps(about, indent=2).encode())
+    sys.exit(failed)
 
 
 if __name__ == "__main__":

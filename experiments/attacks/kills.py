@@ -102,7 +102,7 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
     done, seeds = 0, 0
     while done < kills:
         seeds += 1
-        plans = [plan_runs(folder / name, suite, agents, seeds) for name in ("undisturbed", "killed")]
+        plans = [plan_runs(folder / name, suite, agents, range(seeds)) for name in ("undisturbed", "killed")]
         for undisturbed, killed in zip(*plans, strict=True):
             if undisturbed.seed == seeds - 1:
                 kill_until_done(lambda run=undisturbed: execute(run, settings), 0, rng)  # type: ignore[misc]

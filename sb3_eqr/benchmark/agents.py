@@ -84,7 +84,7 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
     found = yaml.safe_load(file.read_text(encoding="utf-8"))
     if name is not None:
         if name not in found:
-            raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, found)}")
+            raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, map(str, found))}")
         found = found[name]
     label = f"{algo}:{name or file.stem}"
     if not isinstance(found, dict) or "base" not in found or found.keys() - {"base", "changes"}:

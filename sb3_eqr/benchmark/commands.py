@@ -1,4 +1,4 @@
-"""The commands ``sb3-eqr benchmark run|status|report``, apart from the parser, whose help needs none of these imports."""
+"""The commands ``sb3-eqr benchmark run|status|report|pack``, apart from the parser, whose help needs none of these imports."""
 
 import argparse
 import os
@@ -10,6 +10,7 @@ import time
 from rich.console import Console
 
 from sb3_eqr.benchmark.dispatch import Pool, Processes, finish, make_table
+from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
@@ -33,7 +34,9 @@ def check_resources(args: argparse.Namespace) -> str:
     if args.jobs is not None and args.jobs < 1:
         raise ValueError(f"--jobs must be >= 1, got {args.jobs}.")
     if args.ray is None and args.gpus_per_run:
-        raise ValueError(f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU.")
+        raise ValueError(
+            f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU."
+        )
     if args.ray is not None and args.jobs is not None:
         raise ValueError("--jobs cannot be given with --ray, which starts as many runs as its CPUs and GPUs allow.")
     device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
@@ -84,7 +87,9 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
         if getattr(args, name) is not None and getattr(args, name) < 1:
             raise ValueError(f"--{name} must be >= 1, got {getattr(args, name)}.")
     suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps, args.episodes)
-    runs = plan_runs(args.folder, suite, args.agents, read_seeds(args.seeds or str(args.default_seeds), args.first_seed), _command())
+    runs = plan_runs(
+        args.folder, suite, args.agents, read_seeds(args.seeds or str(args.default_seeds), args.first_seed), _command()
+    )
     write_plan(args.folder, suite, runs)
     return runs
 
@@ -135,7 +140,9 @@ def run(args: argparse.Namespace) -> int:
     if failed:
         print("The same command retries them from their last checkpoints.")
     elif left := sum(planned.state().name != "done" for planned in runs):
-        print(f"Stopped after {args.stop_after:g} seconds: {left} of {len(runs)} runs are left. The same command continues them.")
+        print(
+            f"Stopped after {args.stop_after:g} seconds: {left} of {len(runs)} runs are left. The same command continues them."
+        )
     else:
         print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
     return 1 if failed else 0
@@ -163,16 +170,23 @@ def report(args: argparse.Namespace) -> int:
         if not (name and separator and path):
             raise ValueError(f"--reference must be NAME=FILE, got {text!r}.")
         references[name] = pathlib.Path(path)
-    output = args.output or args.folders[0] / "report"
+    first = args.folders[0]
+    output = args.output or (pathlib.Path(first.name.partition(".")[0] + "_report") if first.is_file() else first / "report")
     path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, _command())
     print(f"Written: {path}")
+    return 0
+
+
+def pack_runs(args: argparse.Namespace) -> int:
+    """:return: exit status"""
+    print(f"{pack(args.folder, args.file)} runs in {args.file}")
     return 0
 
 
 def execute(args: argparse.Namespace) -> None:
     """Run a command and exit with its status, or with a message and status 2 if the user has to do something."""
     try:
-        sys.exit({"run": run, "status": status, "report": report}[args.command](args))
+        sys.exit({"run": run, "status": status, "report": report, "pack": pack_runs}[args.command](args))
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:

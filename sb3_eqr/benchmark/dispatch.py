@@ -71,15 +71,19 @@ class Processes:
         self._open: dict[Any, Run] = {}
 
     def start(self, run: Run) -> Any:
-        """Start the process. Its number of threads is set in its environment, which PyTorch reads when it is imported."""
+        """
+        Start a process. It inherits its number of threads, which PyTorch reads when it is imported, and that Ctrl-C, which
+        reaches every process of a terminal, is the parent's to handle.
+        """
         process = SPAWN.Process(target=work, args=(run, self._settings))
-        before = os.environ.get("OMP_NUM_THREADS")
+        threads, handler = os.environ.get("OMP_NUM_THREADS"), signal.signal(signal.SIGINT, signal.SIG_IGN)
         os.environ["OMP_NUM_THREADS"] = str(self._settings.n_threads)
         try:
             process.start()
         finally:
+            signal.signal(signal.SIGINT, handler)
             del os.environ["OMP_NUM_THREADS"]
-            os.environ |= {} if before is None else {"OMP_NUM_THREADS": before}
+            os.environ |= {} if threads is None else {"OMP_NUM_THREADS": threads}
         self._open[process] = run
         return process
 
@@ -112,7 +116,6 @@ class Processes:
 
 def work(run: Run, settings: Settings) -> None:
     """Execute a run as the whole life of this process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal; the parent ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()
     run.folder.mkdir(parents=True, exist_ok=True)
     log = os.open(run.folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -131,10 +134,10 @@ def _end_with_parent() -> None:
 
 def last_line(run: Run) -> str:
     """:return: the last line of what stopped a run, or of what it printed; "" without either"""
-    for name in (ERROR, LOG):
-        with contextlib.suppress(OSError):
-            if lines := (run.folder / name).read_text(encoding="utf-8", errors="replace").split("\n"):
-                return next((line.strip() for line in reversed(lines) if line.strip()), "")
+    for path in (run.folder / ERROR, run.folder / LOG):
+        lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
+        if found := [line.strip() for line in lines if line.strip()]:
+            return found[-1]
     return ""
 
 

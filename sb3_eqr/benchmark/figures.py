@@ -5,8 +5,7 @@ training.
 
 import base64
 import io
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -17,9 +16,9 @@ from matplotlib.figure import Figure
 from rliable import plot_utils
 
 from sb3_eqr.benchmark import statistics
-from sb3_eqr.benchmark.analysis import Analysis, published
+from sb3_eqr.benchmark.analysis import Analysis
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import SHOWN, SHOWN_GROUPS, SHOWN_LOSSES, PublishedMethod
+from sb3_eqr.benchmark.reference import SHOWN
 from sb3_eqr.benchmark.scores import evaluation_curve
 from sb3_eqr.benchmark.tables import aggregate_means
 from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
@@ -29,11 +28,6 @@ N_THRESHOLDS = 81  # points of a performance profile
 N_LOSSES = 20  # points of a loss curve
 SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's defaults are for slides
 INTERVALS = "95% stratified bootstrap intervals"
-# The agents of Figure 5 (b) and of Figure 6, by their names in a benchmark.
-ABLATIONS = {
-    "loss_components": (r"(eqr_\w+):se2\+aet.*", "Losses", SHOWN_LOSSES, "losses, as in Figure 5 (b) of the EqR paper"),
-    "groups": (r"(eqr_\w+):(mlp|t2|se2|gl2)\+aet\+r", "Groups", SHOWN_GROUPS, "group, as in Figure 6 of the EqR paper"),
-}
 
 
 class ReportFigure(NamedTuple):
@@ -73,12 +67,10 @@ def to_png(shown: ReportFigure) -> bytes:
 def all_figures(analysis: Analysis) -> list[ReportFigure]:
     """:return: the figures for which there is data"""
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
-    best = "Higher is better for IQM, median and mean, lower for the optimality gap; as Figure 5 (a) of the EqR paper."
     with styled():
         return [
             _profiles(analysis, style),
-            _intervals(analysis, style, "aggregates", "Aggregate scores", list(analysis.matrices), SHOWN, best),
-            *_ablations(analysis, style),
+            _aggregates(analysis, style),
             *_improvements(analysis, style),
             *_sample_efficiency(analysis, style),
             *_along_training(analysis.comparison, style),
@@ -129,21 +121,13 @@ def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
     return ReportFigure("profiles", "Performance profiles", caption, figure)
 
 
-def _intervals(
-    analysis: Analysis,
-    style: Mapping[str, Look],
-    name: str,
-    title: str,
-    agents: Sequence[str],
-    methods: Sequence[PublishedMethod],
-    explained: str,
-) -> ReportFigure:
-    comparison, metrics = analysis.comparison, list(statistics.METRICS)
+def _aggregates(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
+    comparison, metrics, agents = analysis.comparison, analysis.comparison.metrics, list(analysis.matrices)
     by_agent = analysis.aggregates.set_index(["agent", "metric"])
     points = {comparison.label(a): by_agent.loc[a].loc[metrics, "value"].to_numpy() for a in agents}
     ends = {comparison.label(a): by_agent.loc[a].loc[metrics, ["low", "high"]].to_numpy().T for a in agents}
-    known = aggregate_means(published(comparison, methods), comparison).pivot(index="label", columns="metric", values="value")
-    for method in methods:
+    known = aggregate_means(analysis.means, comparison).pivot(index="label", columns="metric", values="value")
+    for method in SHOWN:
         if method.label in known.index:
             points[f"{method.label}, {method.n_runs}"] = known.loc[method.label, metrics].to_numpy()
             ends[f"{method.label}, {method.n_runs}"] = np.full((2, len(metrics)), np.nan)
@@ -159,27 +143,15 @@ def _intervals(
         ax.set_xlabel(comparison.unit, fontsize="small")
         places = range(len(points))
         ax.plot([values[list(axes).index(ax)] for values in points.values()], places, "o", color=INK, markersize=3)
-    caption = f"{explained} Over all runs and games.{_bands(analysis, 'Bars are')}"
+    gap = "" if analysis.comparison.is_raw else ", lower for the optimality gap"
+    caption = f"Over all runs and games. Higher is better for IQM, median and mean{gap}; as Figure 5 (a) of the EqR paper."
+    caption += _bands(analysis, "Bars are")
     if len(known):
         caption += (
             " Points without a bar are from published game means, over as many runs as named. The IQM and optimality gap of "
             "game means differ slightly from those of runs."
         )
-    return ReportFigure(name, title, caption, figure)
-
-
-def _ablations(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
-    found = []
-    for name, (pattern, title, methods, what) in ABLATIONS.items():
-        by_algorithm: dict[str, list[str]] = {}
-        for agent in analysis.comparison.agents:
-            if match := re.fullmatch(pattern, agent):
-                by_algorithm.setdefault(match[1], []).append(agent)
-        for algorithm, agents in by_algorithm.items():
-            if len(agents) > 1:
-                names = f"{name}_{algorithm}", f"{title} of {algorithm}"
-                found.append(_intervals(analysis, style, *names, agents, methods, f"Agents that differ in their {what}."))
-    return found
+    return ReportFigure("aggregates", "Aggregate scores", caption, figure)
 
 
 def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:

@@ -37,13 +37,6 @@ SHOWN = (
     PublishedMethod("SPR+resets (Nikishin et al., 32 runs, final eval, back-computed from HNS)", "SPR with resets", 32),
     PublishedMethod("BBF RR8_BBF", "BBF, replay ratio 8", 52, 60),
 )
-SHOWN_LOSSES = SHOWN[:4]  # Table 4
-SHOWN_GROUPS = (  # Table 3
-    PublishedMethod("MLP [EqR Tab3]", "MLP (paper)", 10),
-    PublishedMethod("EqR, T_2 [EqR Tab3]", "EqR, T(2) (paper)", 10),
-    PublishedMethod("EqR, SE_2 [EqR Tab3]", "EqR, SE(2) (paper)", 10),
-    PublishedMethod("EqR, GL_2 [EqR Tab3]", "EqR, GL(2) (paper)", 10),
-)
 
 
 def load_reference() -> pd.DataFrame:

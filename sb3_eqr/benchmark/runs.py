@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 from sb3_eqr.benchmark.agents import Agent, defaults, find_agent, hyperparameters
 from sb3_eqr.benchmark.evaluation import check_game
 from sb3_eqr.benchmark.selection import flatten
-from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
+from sb3_eqr.benchmark.suites import Strict, Suite, merge, read_suite, write_suite
 from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.zoo import register
@@ -220,25 +220,11 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / f".{SUITE}.lock"):  # two commands may add games at once
-        _write_suite(folder / SUITE, suite)
+        path = folder / SUITE
+        write_suite(merge(read_suite(path), suite) if path.is_file() else suite, path)
     for run in runs:
         if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
             write_json(run.folder / PLAN, run.description())
-
-
-def _write_suite(path: pathlib.Path, suite: Suite) -> None:
-    if path.is_file():
-        old = read_suite(path)
-        if old.name != suite.name:
-            raise ValueError(
-                f"{path.parent} must hold a benchmark of suite {suite.name!r}, got {old.name!r}. Use another folder."
-            )
-        games = [*old.games, *(game for game in suite.games if game not in old.games)]
-        scores = old.normalisation.scores | suite.normalisation.scores
-        normalisation = suite.normalisation.model_copy(update={"scores": scores})
-        update = {"games": games, "steps": old.steps | suite.steps, "normalisation": normalisation}
-        suite = suite.model_copy(update=update)
-    write_suite(suite, path)
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:

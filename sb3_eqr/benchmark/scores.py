@@ -1,6 +1,5 @@
 """Scores as data: those of a benchmark's runs, and those of other methods' runs from a file."""
 
-import json
 import pathlib
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -10,22 +9,17 @@ import pandas as pd
 from annotated_types import Len
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
+from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import match_games, plain_game
-from sb3_eqr.benchmark.runs import RESULT
 
 # game -> scores of runs
 RUNS = TypeAdapter(Annotated[dict[str, Annotated[list[FiniteFloat], Len(1)]], Len(1)], config={"strict": True})
 COLUMNS = ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
 
 
-def load_results(folder: pathlib.Path) -> list[dict[str, Any]]:
-    """:return: ``result.json`` of every finished run of a benchmark"""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob(f"runs/*/*/*/{RESULT}"))]
-
-
 def score_table(results: list[dict[str, Any]]) -> pd.DataFrame:
     """
-    :param results: see :func:`load_results`
+    :param results: rows of finished runs, see :func:`~sb3_eqr.benchmark.packed.read`
     :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
         (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
     """
@@ -43,11 +37,11 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
     """
     Load every episode of every finished run of a benchmark.
 
-    :param folder: folder of the benchmark
+    :param folder: folder of the benchmark, or a file of ``sb3-eqr benchmark pack``
     :return: see :func:`score_table`
     :raises ValueError: for a folder without finished runs
     """
-    results = load_results(pathlib.Path(folder))
+    results = [row for row in read(pathlib.Path(folder))[1] if "stopped_at" not in row]
     if not results:
         raise ValueError(f"{folder} must be the folder of a benchmark, got one without finished runs.")
     return score_table(results)

@@ -63,6 +63,12 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     return [f"{agent}: its runs differ in {', '.join(sorted(keys))}." for agent, keys in found.items()]
 
 
+def learns_latent_model(result: dict[str, Any]) -> bool:
+    """:return: whether the run's agent is one of EqR with a latent model, rather than stock or without EqR"""
+    settings = {**result.get("defaults", {}), **result["entry"]["hyperparameters"]}
+    return result["entry"]["algo"].startswith("eqr_") and settings.get("prediction_depth") != 0
+
+
 ON_POLICY = ("a2c", "ppo", "ppo_lstm", "trpo")  # RL Zoo's agents that learn after a whole rollout
 
 

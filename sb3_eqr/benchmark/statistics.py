@@ -13,6 +13,7 @@ from scipy.stats import t as student
 from scipy.stats import trim_mean
 
 CONFIDENCE = 0.95
+MIN_RUNS = 3  # for a verdict: two runs hardly show how much scores differ by chance
 REPS = 2_000  # bootstrap samples, stratified by game, as for rliable's profiles
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]  # value, low, high
 
@@ -183,7 +184,7 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
     :param matrices: agent -> (runs, games), normalised scores
     :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, runs, baseline_runs, games, difference (of the IQMs, agent - baseline), detectable
-        (see :func:`detectable_difference`)
+        (see :func:`detectable_difference`; NaN for fewer than ``MIN_RUNS`` runs)
     """
     other = matrices[baseline]
     return pd.DataFrame(
@@ -194,7 +195,9 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
             "baseline_runs": len(other),
             "games": matrix.shape[1],
             "difference": iqm(matrix) - iqm(other),
-            "detectable": detectable_difference(matrix, other, reps, seed),
+            "detectable": detectable_difference(matrix, other, reps, seed)
+            if min(len(matrix), len(other)) >= MIN_RUNS
+            else np.nan,
         }
         for agent, matrix in matrices.items()
         if agent != baseline

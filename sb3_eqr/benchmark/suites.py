@@ -14,6 +14,7 @@ from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.zoo.checks import SIMILAR, nearest
 
+RAW = "raw score"  # the unit of scores that are not normalised
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
 
 
@@ -85,7 +86,7 @@ class Suite(Strict):
         if not isinstance(entry, dict) or not isinstance(entry.get("games"), list):
             return entry  # pydantic reports what is wrong
         games = [game for game in entry["games"] if isinstance(game, str)]
-        found = {"normalisation": {"unit": "raw score", "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
+        found = {"normalisation": {"unit": RAW, "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
         if found["normalisation"] == "human":
             found["normalisation"] = human_scores(games)
         if "steps" in found and not isinstance(found["steps"], dict):
@@ -109,7 +110,10 @@ class Suite(Strict):
 
     def protocol(self, game: str) -> dict[str, Any]:
         """:return: the settings that two scores must share to be comparable"""
-        evaluation, own = self.evaluation.model_dump(), {"env_kwargs": self.env_kwargs[game]} if game in self.env_kwargs else {}
+        evaluation, own = (
+            self.evaluation.model_dump(),
+            {"env_kwargs": self.env_kwargs[game]} if game in self.env_kwargs else {},
+        )
         return {
             "env_id": self.env_id.format(game=game) if isinstance(self.env_id, str) else self.env_id[game],
             "steps": self.steps[game],
@@ -216,6 +220,21 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: i
             )
     evaluation = suite.evaluation if episodes is None else suite.evaluation.model_copy(update={"episodes": episodes})
     return suite.model_copy(update={"games": kept, "steps": per_game, "evaluation": evaluation})
+
+
+def merge(old: Suite, new: Suite) -> Suite:
+    """
+    :return: the new suite, with the games of the old one before its own
+    :raises ValueError: if they are not the same suite
+    """
+    if old.name != new.name:
+        raise ValueError(
+            f"The runs must be of suite {old.name!r}, as those that are there, got {new.name!r}. Use another place."
+        )
+    scores = old.normalisation.scores | new.normalisation.scores
+    update: dict[str, Any] = {"normalisation": new.normalisation.model_copy(update={"scores": scores})}
+    update |= {"games": [*dict.fromkeys([*old.games, *new.games])], "steps": old.steps | new.steps}
+    return new.model_copy(update=update)
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:

@@ -335,7 +335,12 @@ def train(run: Run, settings: Settings) -> str:
         try:
             model.learn(steps - model.num_timesteps, [*manager.callbacks, callback], reset_num_timesteps=not found)
         except OutOfTime:
-            row = {"stopped_at": model.num_timesteps, **provenance(run, model, settings), **times(run, model, record), **record}
+            row = {
+                "stopped_at": model.num_timesteps,
+                **provenance(run, model, settings),
+                **times(run, model, record),
+                **record,
+            }
             write_json(run.folder / STOPPED, row)
             return "stopped"
         write_checkpoint(run.folder, model, record, with_buffer=False)

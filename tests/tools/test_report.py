@@ -8,16 +8,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from rliable import library, metrics
+from scipy.stats import t
 
 from sb3_eqr.benchmark import figures
 from sb3_eqr.benchmark import report as report_module
 from sb3_eqr.benchmark.analysis import analyse, conclusion, difference_in_words
 from sb3_eqr.benchmark.comparison import compare
 from sb3_eqr.benchmark.figures import all_figures, normalized_curves, symmetry_losses
+from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.reference import SHOWN, published_means
 from sb3_eqr.benchmark.report import write_report
+from sb3_eqr.benchmark.scores import load_scores
 from sb3_eqr.benchmark.suites import make_suite, write_suite
-from sb3_eqr.benchmark.tables import make_table, number, to_html, to_latex, to_markdown
+from sb3_eqr.benchmark.tables import difference_table, make_table, number, to_html, to_latex, to_markdown
 from sb3_eqr.plot_style import looks
 
 PONG, BOXING, KRULL = [-20.7, 14.6], [0.1, 12.1], [1598.0, 2665.5]  # Table 2: random, human
@@ -177,7 +180,7 @@ def test_the_table_of_games(report):
         and "<td>−12.0<br><small>± 2.0</small></td>" in page
     )
     lines = [re.sub(" +", " ", line) for line in report.with_name("table.md").read_text().splitlines()]
-    rows = {line[2:].partition(" |")[0]: line for line in lines}
+    rows = {line[2:].partition(" |")[0]: line for line in reversed(lines)}  # without the second table, of differences
     assert rows["Krull"].startswith("| Krull | 1,598 | 2,666 | 1,798 ± 200 | 3,000 ± 200 | 3,033 ± 306 |")
     assert "| 12.0 ± 2.0 | 12.0 ± 3.0 |" in rows["Boxing"]
     assert rows["minutes per run"].startswith("| minutes per run | | | 30.0 | 30.0 | 30.0 | – |")
@@ -199,14 +202,12 @@ def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
 
 def test_the_files_of_a_report(drawn, report):
     names = {"profiles", "aggregates", "improvement", "sample_efficiency", "learning_curves", "symmetry_losses"}
-    names |= {"loss_components_eqr_rainbow"}  # drawn for two loss combinations, but not for a single group
-    data = {"report.html", "table.md", "table.tex", "scores.csv", "scores.parquet", "aggregates.csv"}
+    data = {"report.html", "table.md", "table.tex", "scores.csv", "aggregates.csv"}
     assert {path.name for path in drawn.parent.iterdir()} == data | {f"{name}.png" for name in names}
     for path in drawn.parent.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG") and path.read_bytes().endswith(b"IEND\xaeB`\x82")
     scores = pd.read_csv(report.with_name("scores.csv"))
     assert len(scores) == 27 * (2 + 1 + 2 + 1) and set(scores["kind"]) == {"curve", "final", "training"}
-    pd.testing.assert_frame_equal(scores, pd.read_parquet(report.with_name("scores.parquet")))
 
 
 def test_the_page_is_self_contained(drawn):
@@ -427,16 +428,6 @@ def test_one_agent_one_game_one_seed(tmp_path, not_drawn):
     assert found[-1].caption.endswith("A single run each.")
 
 
-def test_without_pyarrow_the_parquet_file_is_skipped(tmp_path, not_drawn, monkeypatch):
-    def missing(self, *args, **kwargs):
-        raise ImportError("pyarrow")
-
-    monkeypatch.setattr(pd.DataFrame, "to_parquet", missing)
-    page = write_report([a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]})], {}, False, tmp_path / "report", reps=5)
-    assert "scores.parquet was left out: it needs pyarrow" in text_of(page)
-    assert not page.with_name("scores.parquet").exists() and page.with_name("scores.csv").exists()
-
-
 def test_other_units_have_no_published_scores(tmp_path, not_drawn):
     suite = normalised("random play 0, solved 1")
     text = text_of(write_report([a_benchmark(tmp_path / "a", suite=suite)], {}, False, tmp_path / "report", reps=5))
@@ -445,14 +436,14 @@ def test_other_units_have_no_published_scores(tmp_path, not_drawn):
 
 def test_a_reference_with_runs_has_intervals(tmp_path, not_drawn):
     file = tmp_path / "theirs.json"
-    file.write_text(json.dumps({"pong": [0.0, 1.0], "BOXING": [5.0, 6.0], "kr_ull": [2000, 2100], "Hero": [1.0]}))
+    theirs = {"pong": [0.0, 1.0, 0.5], "BOXING": [5.0, 6.0, 5.5], "kr_ull": [2000, 2100, 2050], "Hero": [1.0] * 3}
+    file.write_text(json.dumps(theirs))
     page = write_report([a_benchmark(tmp_path / "a")], {"THEIRS": file}, False, tmp_path / "report", reps=20)
     rows = pd.read_csv(page.with_name("aggregates.csv")).query("agent == 'THEIRS'").set_index("metric")
-    scores = matrix("T", {"T": {"Pong": [0.0, 1.0], "Boxing": [5.0, 6.0], "Krull": [2000, 2100]}})
-    assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 2
+    scores = matrix("T", {"T": dict(zip(("Pong", "Boxing", "Krull"), theirs.values(), strict=False))})
+    assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 3
     assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
-    assert "THEIRS: first 2 runs only, as many as Krull has" not in text_of(page)
-    assert "THEIRS is better than dqn" in text_of(page) and "2 and 3 runs on 3 games" in text_of(page)
+    assert "THEIRS is better than dqn" in text_of(page) and "; 3 runs on 3 games" in text_of(page)
     with pytest.raises(ValueError, match="--reference must have a name that no agent has, got 'dqn'"):
         compare([tmp_path / "a"], {"dqn": file}, False)
 
@@ -511,12 +502,6 @@ def test_empty_figures_are_omitted(tmp_path):
     assert [shown.name for shown in found] == ["profiles", "aggregates"]
 
 
-def test_ablations_of_groups_have_a_figure(tmp_path):
-    scores = {"eqr_qrdqn:mlp+aet+r": SCORES["dqn"], "eqr_qrdqn:gl2+aet+r": SCORES[FULL], FULL: SCORES[FULL]}
-    found = {p.name for p in all_figures(analyse(compare([a_benchmark(tmp_path / "a", scores)], {}, False), 5))}
-    assert "groups_eqr_qrdqn" in found and not {"groups_eqr_rainbow", "loss_components_eqr_rainbow"} & found
-
-
 def test_agents_can_be_told_apart_without_colours():
     style = looks([str(i) for i in range(66)])
     assert len({(look.line, look.marker) for look in style.values()}) == 66
@@ -542,3 +527,68 @@ def test_numbers(value, decimals, text):
 def test_published_means_use_the_names_of_the_suite():
     means = published_means(SHOWN, ["Bank_Heist", "Tetris", "Pong"])
     assert means.index.tolist() == ["Bank_Heist", "Pong"] and means.at["Pong", "EqR, R (paper)"] == -6.0
+
+
+def test_two_runs_have_no_verdict(tmp_path, not_drawn):
+    """However far apart they are."""
+    scores = {"dqn": {"Pong": [-20.0, -19.9]}, FULL: {"Pong": [20.0, 19.9]}}
+    page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=20)
+    text = text_of(page)
+    assert "2 runs per game do not show how much of that is chance" in text and "is better than dqn" not in text
+    assert "<b>" not in text
+
+
+def test_raw_scores_have_no_gap_and_no_bounds(tmp_path, not_drawn):
+    suite = make_suite("own", "test", {key: value for key, value in ENTRY.items() if key != "normalisation"})
+    page = write_report([a_benchmark(tmp_path / "a", suite=suite)], {}, False, tmp_path / "report", reps=5)
+    for text in (text_of(page), page.with_name("table.md").read_text(), page.with_name("aggregates.csv").read_text()):
+        assert not re.search("optimality gap|score 0|score 1|games above|normalised scores", text), text
+    assert [shown.name for shown in all_figures(analyse(compare([tmp_path / "a"], {}, False), 5))][1] == "aggregates"
+
+
+def test_the_baseline_is_the_same_agent_without_eqr_where_no_stock_agent_ran(tmp_path):
+    def change(result):
+        result["entry"] |= {
+            "algo": "eqr_rainbow",
+            "hyperparameters": {"prediction_depth": 5 if result["agent"] == BASE else 0},
+        }
+        return result
+
+    scores = {BASE: SCORES[BASE], "eqr_rainbow:zero": SCORES[FULL]}
+    assert compare([a_benchmark(tmp_path / "a", scores, change=change)], {}, False).agents == ["eqr_rainbow:zero", BASE]
+
+
+def test_differences_per_game_have_welch_intervals(tmp_path, not_drawn):
+    """Means 4 and 1, variances 4 and 1, three seeds each: s² = 5/3, (5/3)² / ((4/3)² / 2 + (1/3)² / 2) degrees of freedom."""
+    scores = {"dqn": {"Pong": [0.0, 1.0, 2.0]}, FULL: {"Pong": [2.0, 4.0, 6.0]}}
+    half = t.ppf(0.975, (25 / 9) / (16 / 18 + 1 / 18)) * (5 / 3) ** 0.5
+    found = difference_table(compare([a_benchmark(tmp_path / "a", scores)], {}, True)).cells
+    assert found.to_numpy().tolist() == [["Pong", f"3.00\n[{number(3 - half)}, {number(3 + half)}]"]]
+    assert half == pytest.approx(4.15, abs=0.1)  # t is 3.18 for 3 degrees of freedom
+
+
+def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
+    """In two parts, of which the second replaces a run, without what was stopped and the machine's folders."""
+    file = tmp_path / "all.jsonl.xz"
+
+    def change(result):
+        command = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml".replace("TOP", "/a/b-1")
+        return result | {"command": command} | ({"stopped_at": 7} if result["seed"] == 2 else {})
+
+    first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]}, change=change)
+    assert pack(first, file) == 9
+    both = a_benchmark(tmp_path / "b", {"dqn": {"Pong": [7.0, 8.0]}, FULL: SCORES[FULL]}, change=change)
+    assert pack(both, file) == 18
+    found = compare([file], {}, False)
+    assert found.games == SUITE.games and found.agents == ["dqn", FULL] and found.bounds["Pong"] == tuple(PONG)
+    assert found.notes[0] == "6 runs were stopped before their end and are left out."
+    raw = {key: rows["raw"].tolist() for key, rows in found.scores.groupby(["agent", "game"])}
+    assert raw["dqn", "Pong"] == [7.0, 8.0] and raw["dqn", "Krull"] == [1598.0, 1798.0]
+    assert found.results[0]["command"] == "run here --agents dqn:a.yml dqn:settings/b.yml"
+    assert len(load_scores(file)) == 12 * 6
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match="must be a file of sb3-eqr benchmark pack, got another or a damaged one"):
+        compare([file], {}, False)
+    next(both.glob("runs/*/*/*/result.json")).write_text("{")
+    with pytest.raises(ValueError, match=r"result.json must be the result of a run, got a damaged file"):
+        compare([both], {}, False)

@@ -175,11 +175,11 @@ def test_games_above_a_threshold_are_counted_by_their_means():
 
 
 def test_differences_of_iqms():
-    first, second = np.array([[0.0], [1.0]]), np.array([[2.0], [2.0], [2.0]])
-    row = iqm_differences({"a": first, "b": second, "c": first[:1]}, "a", reps=100).to_dict("records")
+    first, second = np.array([[0.0], [1.0], [0.5]]), np.array([[2.0], [2.0], [2.0]])
+    row = iqm_differences({"a": first, "b": second, "c": first[:2]}, "a", reps=100).to_dict("records")
     assert row[0]["difference"] == pytest.approx(1.5) and (row[0]["runs"], row[0]["baseline_runs"], row[0]["games"]) == (
         3,
-        2,
+        3,
         1,
     )
     assert row[0]["detectable"] == detectable_difference(second, first, reps=100) and np.isnan(row[1]["detectable"])

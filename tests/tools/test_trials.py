@@ -98,7 +98,14 @@ def test_the_ablation_compares_with_the_entry_game_by_game(tmp_path):
 
 def test_a_failed_trial_is_an_error(tmp_path):
     (tmp_path / "trials.yml").write_text(yaml.safe_dump({"wrong": {"agent": "rainbow", "changes": {"gama": 0.9}}}))
-    command = [sys.executable, "-m", "experiments.trials", str(tmp_path / "trials.yml"), "--rows", str(tmp_path / "rows.jsonl")]
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.trials",
+        str(tmp_path / "trials.yml"),
+        "--rows",
+        str(tmp_path / "rows.jsonl"),
+    ]
     found = subprocess.run([*command, "--games", "Breakout", "--seeds", "0"], capture_output=True, text=True, check=False)
     assert found.returncode == 1
     assert "gama" in found.stderr and "These runs failed, see their errors above: ('wrong', 'Breakout', 0)" in found.stderr
