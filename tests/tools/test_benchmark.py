@@ -462,5 +462,5 @@ def test_an_entry_without_eqr_builds_its_agent(algo):
 
 
 def test_scores_without_runs(tmp_path):
-    with pytest.raises(ValueError, match="got one without suite.yml"):
+    with pytest.raises(ValueError, match=r"got one without suite\.yml"):
         benchmark.load_scores(tmp_path)
