@@ -96,8 +96,6 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
 
 def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:
     """
-    :param agent: the agent
-    :param entry: its hyperparameters
     :return: the defaults of the algorithm for what the entry leaves out, and of its policy, as far as they are plain data:
         where they change between versions, the same entry makes another agent
     """

@@ -26,7 +26,6 @@ class Analysis:
     :param means: rows games, columns published methods, raw mean scores
     :param differences: differences of IQMs from the first agent and from the best, see
         :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
-    :param improvements: over the first agent, see :func:`~sb3_eqr.benchmark.statistics.improvement_probabilities`
     :param reps: bootstrap samples behind all intervals
     """
 
@@ -35,7 +34,6 @@ class Analysis:
     aggregates: pd.DataFrame
     means: pd.DataFrame
     differences: pd.DataFrame
-    improvements: pd.DataFrame
     reps: int
 
 
@@ -57,7 +55,6 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
         statistics.aggregate(matrices, reps),
         published(comparison, SHOWN),
         differences,
-        statistics.improvement_probabilities(matrices, baseline, reps),
         reps,
     )
 

@@ -17,7 +17,7 @@ LOCAL = "local"  # the address of this machine
 
 class Cluster:
     """
-    A Ray task per run, as a :class:`~sb3_eqr.benchmark.dispatch.Pool`; Ray decides how many run at once.
+    A Ray task per run, with the methods of :class:`~sb3_eqr.benchmark.dispatch.Processes`; Ray decides how many run at once.
 
     :param settings: settings of all runs
     :param address: address of a Ray cluster that can access the benchmark's folder, or ``LOCAL``

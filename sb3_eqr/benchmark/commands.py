@@ -6,10 +6,11 @@ import pathlib
 import shlex
 import sys
 import time
+from typing import Any
 
 from rich.console import Console
 
-from sb3_eqr.benchmark.dispatch import Pool, Processes, finish, make_table
+from sb3_eqr.benchmark.dispatch import Processes, finish, make_table
 from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
@@ -20,19 +21,20 @@ from sb3_eqr.zoo.checks import check_device, fail
 
 def check_resources(args: argparse.Namespace) -> str:
     """
-    :param args: arguments of ``run``
     :return: the device of every run
     :raises ValueError: for resources that are invalid or not available
     """
-    if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
-        found = f"{args.cpus_per_run} and {args.gpus_per_run}"
-        raise ValueError(f"--cpus-per-run must be > 0 and --gpus-per-run >= 0, got {found}.")
-    if args.checkpoint_every < 0:
-        raise ValueError(f"--checkpoint-every must be >= 0 seconds, got {args.checkpoint_every}.")
-    if args.stop_after is not None and args.stop_after <= 0:
-        raise ValueError(f"--stop-after must be > 0 seconds, got {args.stop_after}.")
-    if args.jobs is not None and args.jobs < 1:
-        raise ValueError(f"--jobs must be >= 1, got {args.jobs}.")
+    for flag, is_right, needed in (
+        ("cpus_per_run", args.cpus_per_run > 0, "> 0"),
+        ("gpus_per_run", args.gpus_per_run >= 0, ">= 0"),
+        ("checkpoint_every", args.checkpoint_every >= 0, ">= 0 seconds"),
+        ("stop_after", args.stop_after is None or args.stop_after > 0, "> 0 seconds"),
+        ("jobs", args.jobs is None or args.jobs >= 1, ">= 1"),
+        ("steps", args.steps is None or args.steps >= 1, ">= 1"),
+        ("episodes", args.episodes is None or args.episodes >= 1, ">= 1"),
+    ):
+        if not is_right:
+            raise ValueError(f"--{flag.replace('_', '-')} must be {needed}, got {getattr(args, flag):g}.")
     if args.ray is None and args.gpus_per_run:
         raise ValueError(
             f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU."
@@ -47,7 +49,7 @@ def check_resources(args: argparse.Namespace) -> str:
     return device
 
 
-def make_pool(args: argparse.Namespace, settings: Settings) -> Pool:
+def make_pool(args: argparse.Namespace, settings: Settings) -> Any:
     """
     :param args: arguments of ``run``
     :param settings: settings of all runs
@@ -83,9 +85,6 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
         return with_present_defaults(read_plan(args.folder))
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")
-    for name in ("steps", "episodes"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            raise ValueError(f"--{name} must be >= 1, got {getattr(args, name)}.")
     suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps, args.episodes)
     runs = plan_runs(
         args.folder, suite, args.agents, read_seeds(args.seeds or str(args.default_seeds), args.first_seed), _command()

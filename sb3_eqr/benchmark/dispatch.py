@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter, deque
 from multiprocessing import connection
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -32,34 +32,9 @@ class Crash(Exception):
     """A run ended without an outcome; the message is the reason."""
 
 
-class Pool(Protocol):
-    """
-    Where runs are executed: :class:`Processes`, or a cluster. Handles are hashable.
-
-    ``slots`` is the number of runs that it takes at once.
-    """
-
-    slots: float
-
-    def start(self, run: Run) -> Any:
-        """:return: a handle"""
-
-    def wait(self, handles: list[Any], timeout: float) -> list[Any]:
-        """:return: handles of runs that have ended, none if there are none within ``timeout`` seconds"""
-
-    def outcome(self, handle: Any) -> str:
-        """
-        :return: what :func:`~sb3_eqr.benchmark.training.execute` returned
-        :raises Crash: if it did not return
-        """
-
-    def close(self) -> None:
-        """End all runs."""
-
-
 class Processes:
     """
-    A process per run, which returns all memory of the run when it ends.
+    A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods.
 
     :param settings: settings of all runs
     :param slots: number of processes at once
@@ -142,11 +117,7 @@ def last_line(run: Run) -> str:
 
 
 def make_table(runs: list[Run], states: list[State]) -> Table:
-    """
-    :param runs: runs of the benchmark
-    :param states: their states
-    :return: a row per agent, and one for all agents
-    """
+    """:return: a row per agent, and one for all agents"""
     table = Table(box=None, pad_edge=False, caption_justify="left")
     for column in ("agent", "done", "running", "waiting", "failed", "steps", "steps/s"):
         table.add_column(column, justify="left" if column == "agent" else "right")
@@ -164,7 +135,7 @@ def make_table(runs: list[Run], states: list[State]) -> Table:
     return table
 
 
-def finish(pool: Pool, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
+def finish(pool: Any, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
     """
     Execute runs: interrupted ones resume from their last checkpoint, runs that another process holds are waited for. A run
     that crashes twice has failed; the others continue. When ``settings.stop_at`` has passed, no further run starts.

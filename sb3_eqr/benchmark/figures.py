@@ -1,5 +1,5 @@
 """
-The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 to 7 of the EqR paper, and curves over
+The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 and 5 of the EqR paper, and curves over
 training.
 """
 
@@ -25,7 +25,6 @@ from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
 
 DPI = 160
 N_THRESHOLDS = 81  # points of a performance profile
-N_LOSSES = 20  # points of a loss curve
 SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's defaults are for slides
 INTERVALS = "95% stratified bootstrap intervals"
 
@@ -71,9 +70,8 @@ def all_figures(analysis: Analysis) -> list[ReportFigure]:
         return [
             _profiles(analysis, style),
             _aggregates(analysis, style),
-            *_improvements(analysis, style),
             *_sample_efficiency(analysis, style),
-            *_along_training(analysis.comparison, style),
+            *_learning_curves(analysis.comparison, style),
         ]
 
 
@@ -154,33 +152,6 @@ def _aggregates(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
     return ReportFigure("aggregates", "Aggregate scores", caption, figure)
 
 
-def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
-    rows, label = analysis.improvements.to_dict("records"), analysis.comparison.label
-    if not rows:
-        return []
-    baseline = label(rows[0]["baseline"])
-    figure, ax = plt.subplots(figsize=(5, 0.6 + 0.3 * len(rows)))
-    plot_utils.plot_probability_of_improvement(
-        {f"{label(row['agent'])}|{baseline}": row["value"] for row in rows},
-        {f"{label(row['agent'])}|{baseline}": (row["low"], row["high"]) for row in rows},
-        pair_separator="|",
-        ax=ax,
-        colors=[style[label(row["agent"])].color for row in rows],
-        xlabel=f"P(a run scores higher than one of {baseline})",
-        left_ylabel="",
-        right_ylabel="",
-        **SIZES,
-    )
-    figure.axes[-1].set_yticks([])  # the baseline's name, repeated in every row
-    ax.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
-    ax.set_xlim(-0.02, 1.02)
-    caption = (
-        f"How likely a run of an agent scores higher than one of the baseline, {baseline} (--baseline, or the "
-        f"first stock agent), averaged over games.{_bands(analysis, 'Bars are')}"
-    )
-    return [ReportFigure("improvement", "Probability of improvement", caption, figure)]
-
-
 def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """
     :return: agent -> fractions of the training steps (points,), normalised scores (runs, games, points); agents whose runs
@@ -245,53 +216,20 @@ def learning_curves(comparison: Comparison) -> pd.DataFrame:
     for run in comparison.results:
         steps, scores = evaluation_curve(run)
         if len(steps) > 1:
-            frames.append(_rows(run, comparison, steps, scores))
+            named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
+            frames.append(pd.DataFrame({"step": steps / 1_000, "value": scores}).assign(**named))
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
-def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
-    """
-    :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21, or the one of them that the agent has,
-        averaged over twentieths of the training, interpolated where a run logged none, and left out before and after the
-        first and last of all its runs; agents with neither are left out
-    """
-    frames = []
-    for run in comparison.results:
-        rows = [row for row in run.get("losses", []) if "aet_loss" in row or "symmetry_loss" in row]
-        if len(rows) > 1:
-            table = pd.DataFrame(rows).reindex(columns=["step", "aet_loss", "symmetry_loss"]).fillna(0.0)
-            part = run["protocol"]["steps"] / N_LOSSES
-            means = (table["aet_loss"] + table["symmetry_loss"]).groupby(np.ceil(table["step"] / part)).mean()
-            means = means.reindex(range(1, N_LOSSES + 1)).interpolate(limit_area="inside").dropna()
-            frames.append(_rows(run, comparison, means.index.to_numpy() * part, means.to_numpy()))
-    if not frames:
-        return pd.DataFrame()
-    found = pd.concat(frames, ignore_index=True)
-    runs = found.groupby(["game", "agent"])["seed"].transform("nunique")
-    return found[found.groupby(["game", "agent", "step"])["seed"].transform("nunique") == runs]
-
-
-def _rows(run: dict[str, Any], comparison: Comparison, steps: np.ndarray, values: np.ndarray) -> pd.DataFrame:
-    named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
-    return pd.DataFrame({"step": steps / 1_000, "value": values}).assign(**named)
-
-
-def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
-    scores, losses = learning_curves(comparison), symmetry_losses(comparison)
-    about_scores = "Raw scores of the evaluations during training."
-    about_losses = "L_AET + L_GET during training, as Figure 7 of the EqR paper; for agents with only one of them, that one."
-    found = []
-    for name, table, ylabel, caption in (
-        ("learning curves", scores, "mean raw score", about_scores),
-        ("symmetry losses", losses, "$L_{AET} + L_{GET}$", about_losses),
-    ):
-        if len(table):
-            band = " Means over runs ± one standard deviation."
-            band = band if table["seed"].nunique() > 1 else " A single run each."
-            shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
-            figure = _small_multiples(table, ylabel, shown)
-            found.append(ReportFigure(name.replace(" ", "_"), name.capitalize(), caption + band, figure))
-    return found
+def _learning_curves(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
+    table = learning_curves(comparison)
+    if not len(table):
+        return []
+    several = table["seed"].nunique() > 1
+    caption = "Raw scores of the evaluations during training. "
+    caption += "Means over runs ± one standard deviation." if several else "A single run each."
+    shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
+    return [ReportFigure("learning_curves", "Learning curves", caption, _small_multiples(table, "mean raw score", shown))]
 
 
 def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]) -> Figure:

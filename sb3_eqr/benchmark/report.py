@@ -23,7 +23,6 @@ from sb3_eqr.benchmark.tables import (
     number,
     summary_table,
     to_html,
-    to_latex,
     to_markdown,
 )
 from sb3_eqr.common.saving.files import atomic_write
@@ -42,7 +41,7 @@ def write_report(
     reps: int = REPS,
 ) -> pathlib.Path:
     """
-    Write report.html, its figures as PNG, table.md, table.tex, scores.csv and aggregates.csv.
+    Write report.html, its figures as PNG, table.md, scores.csv and aggregates.csv.
 
     :param folders: folders of benchmarks, with suite.yml and runs/, or files of ``sb3-eqr benchmark pack``
     :param references: name -> JSON file with the runs of another method, game -> raw scores
@@ -60,7 +59,7 @@ def write_report(
     figures = all_figures(analysis)
     table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
     files = {f"{figure.name}.png": to_png(figure) for figure in figures}
-    files |= _table_files(analysis, table)
+    files["table.md"] = _markdown(analysis, table)
     for name, data in (("scores.csv", comparison.episodes), ("aggregates.csv", aggregates_file(analysis))):
         files[name] = data.to_csv(index=False).encode()
     before, shown = notes(analysis), conclusion(analysis)
@@ -113,11 +112,10 @@ def _lead(comparison: Comparison) -> str:
     )
 
 
-def _table_files(analysis: Analysis, table: Table) -> dict[str, bytes]:
+def _markdown(analysis: Analysis, table: Table) -> bytes:
     about = [*conclusion(analysis), *notes(analysis), *table_notes(analysis)]
     compared = to_markdown(difference_table(analysis.comparison)) if len(analysis.matrices) > 1 else ""
-    markdown = "\n".join([to_markdown(table), *(f"- {note}" for note in about), "", compared])
-    return {"table.md": markdown.encode(), "table.tex": ("".join(f"% {note}\n" for note in about) + to_latex(table)).encode()}
+    return "\n".join([to_markdown(table), *(f"- {note}" for note in about), "", compared]).encode()
 
 
 def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
@@ -138,7 +136,6 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
 
 def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
     """
-    :param path: keys of the settings in a result
     :return: a row per setting, a column per agent; where runs of an agent differ, all values separated by "/"
     """
 

@@ -150,11 +150,6 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], seeds: Sequ
     Plan the runs of a benchmark, without writing anything. The seed is the outermost loop, so that an interrupted benchmark
     has complete tables of fewer seeds.
 
-    :param folder: folder of the benchmark
-    :param suite: the suite
-    :param agents: agents as given by the user
-    :param seeds: the seeds
-    :param command: the command of the user
     :raises ValueError: for two agents of the same name, or for runs that exist with other settings
     """
     found = [find_agent(text) for text in agents]
@@ -178,7 +173,6 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], seeds: Sequ
 
 def with_present_defaults(runs: list[Run]) -> list[Run]:
     """
-    :param runs: runs of a folder
     :return: the same, where those without a result have the defaults of this version of the package
     :raises ValueError: if a run that has begun was started with others
     """

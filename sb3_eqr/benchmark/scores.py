@@ -48,10 +48,7 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
 
 
 def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """
-    :param result: result of a run
-    :return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one
-    """
+    """:return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one"""
     found: dict[int, float] = {}
     for evaluation in sorted(result["evaluations"], key=lambda row: row["kind"] == "final"):  # the final one overrides
         if evaluation["scores"]:

@@ -127,39 +127,6 @@ def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Es
     return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps=reps, seed=seed)
 
 
-def probability_of_improvement(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """
-    How likely a run of the first agent beats one of the second, averaged over games; ties count as one half.
-
-    :param first: (..., runs, games)
-    :param second: (..., runs, games), where the number of runs may differ from the first's
-    :return: (...), in [0, 1]
-    """
-    wins = [
-        (run > second).mean(axis=(-2, -1)) + 0.5 * (run == second).mean(axis=(-2, -1))
-        for run in np.moveaxis(first[..., None, :], -3, 0)
-    ]
-    return np.mean(wins, axis=0)
-
-
-def improvement_probabilities(
-    matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS, seed: int = 0
-) -> pd.DataFrame:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :param baseline: the agent that the others are compared with
-    :return: columns agent, baseline, value, low, high; a row per agent other than the baseline
-    """
-    rows = [
-        (agent, baseline, *estimate(probability_of_improvement, matrix, matrices[baseline], reps=reps, seed=seed))
-        for agent, matrix in matrices.items()
-        if agent != baseline
-    ]
-    return pd.DataFrame(rows, columns=["agent", "baseline", "value", "low", "high"]).astype(
-        {"value": float, "low": float, "high": float}
-    )
-
-
 def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS, seed: int = 0) -> float:
     """
     The smallest difference between the IQMs of two agents that their runs can detect: half the width of the 95 % interval

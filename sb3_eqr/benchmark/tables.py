@@ -12,8 +12,6 @@ from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM
 from sb3_eqr.benchmark.statistics import METRICS, MIN_RUNS, detectable_difference, games_above, iqm
 
-LATEX = {"±": r"$\pm$", "−": "$-$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}"}  # pandas does not escape these
-
 
 class Table(NamedTuple):
     """
@@ -55,17 +53,6 @@ def to_markdown(table: Table) -> str:
     cells = table.emphasised("**", "**").replace(r"\n", " ", regex=True).replace(r"\|", r"\\|", regex=True)
     align = ("left", *["right"] * (len(cells.columns) - 1))
     return cells.to_markdown(index=False, disable_numparse=True, colalign=align) + "\n"
-
-
-def to_latex(table: Table) -> str:
-    """:return: a ``tabular`` with rules of the package booktabs"""
-    cells = table.cells.replace(r"\n", " ", regex=True)
-    style = cells.style.format(escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
-    style = style.apply(lambda _: table.bold.replace({True: "font-weight: bold", False: ""}), axis=None)
-    text = style.to_latex(hrules=True, convert_css=True, column_format="l" + "r" * (len(cells.columns) - 1))
-    for sign, command in LATEX.items():
-        text = text.replace(sign, command)
-    return "% Needs \\usepackage{booktabs}.\n" + text
 
 
 def number(value: float, decimals: int | None = None) -> str:

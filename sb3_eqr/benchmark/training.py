@@ -204,7 +204,6 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     """
     Build the agent as RL Zoo does, on environments that write no files.
 
-    :param logs: folder for the files that RL Zoo writes next to a model
     :return: the agent, and RL Zoo's manager, which has the callbacks of its entry and saves the agent
     """
     env_id, kwargs = run.protocol["env_id"], run.entry.get("env_kwargs")

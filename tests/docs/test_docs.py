@@ -349,7 +349,6 @@ STORY = [  # lines of the pages in a working order, and arguments that shorten t
     ("sb3-eqr benchmark status results/smoke", ""),
     ("sb3-eqr benchmark report results/smoke", ""),
     ("python examples/demo.py --game Boxing --config se2+aet --steps 100000", "--steps 30 --eval-episodes 1"),
-    ("python examples/cartpole.py --seeds 0 1 2 3 4", "--seeds 0 --steps 1100"),
     (
         "python examples/blind_cliffwalk.py --seeds 10 --json docs/results/cliffwalk.json",
         "--seeds 1 --states 2 --json cliffwalk.json",

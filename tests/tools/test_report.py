@@ -14,13 +14,13 @@ from sb3_eqr.benchmark import figures
 from sb3_eqr.benchmark import report as report_module
 from sb3_eqr.benchmark.analysis import analyse, conclusion, difference_in_words
 from sb3_eqr.benchmark.comparison import compare
-from sb3_eqr.benchmark.figures import all_figures, normalized_curves, symmetry_losses
+from sb3_eqr.benchmark.figures import all_figures, normalized_curves
 from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.reference import SHOWN, published_means
 from sb3_eqr.benchmark.report import write_report
 from sb3_eqr.benchmark.scores import load_scores
 from sb3_eqr.benchmark.suites import make_suite, write_suite
-from sb3_eqr.benchmark.tables import difference_table, make_table, number, to_html, to_latex, to_markdown
+from sb3_eqr.benchmark.tables import difference_table, make_table, number, to_html, to_markdown
 from sb3_eqr.plot_style import looks
 
 PONG, BOXING, KRULL = [-20.7, 14.6], [0.1, 12.1], [1598.0, 2665.5]  # Table 2: random, human
@@ -184,9 +184,6 @@ def test_the_table_of_games(report):
     assert rows["Krull"].startswith("| Krull | 1,598 | 2,666 | 1,798 ± 200 | 3,000 ± 200 | 3,033 ± 306 |")
     assert "| 12.0 ± 2.0 | 12.0 ± 3.0 |" in rows["Boxing"]
     assert rows["minutes per run"].startswith("| minutes per run | | | 30.0 | 30.0 | 30.0 | – |")
-    tex = report.with_name("table.tex").read_text()
-    assert r"eqr\_rainbow:se2+aet+r" in tex and r"3,033 $\pm$ 306" in tex and "bfseries" not in tex
-    assert "eqr_rainbow" not in "".join(line for line in tex.splitlines(keepends=True) if not line.startswith("%"))
 
 
 def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
@@ -195,14 +192,13 @@ def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
     scores = {"dqn": {"Pong": apart, "Boxing": apart}, FULL: {"Pong": [2 * score for score in apart], "Boxing": alike}}
     page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=100)
     assert re.findall("<b>(.*?)</b>", page.read_text())[1:] == ["20.0", "1.000"]  # the first is the IQM of the summary
-    assert r"\bfseries 20.0 $\pm$ 1.6" in page.with_name("table.tex").read_text()
     assert "**20.0** ± 1.6" in page.with_name("table.md").read_text()
     assert f"{FULL} is better than dqn: its IQM is" in text_of(page).partition("Aggregates</h2>")[0]
 
 
 def test_the_files_of_a_report(drawn, report):
-    names = {"profiles", "aggregates", "improvement", "sample_efficiency", "learning_curves", "symmetry_losses"}
-    data = {"report.html", "table.md", "table.tex", "scores.csv", "aggregates.csv"}
+    names = {"profiles", "aggregates", "sample_efficiency", "learning_curves"}
+    data = {"report.html", "table.md", "scores.csv", "aggregates.csv"}
     assert {path.name for path in drawn.parent.iterdir()} == data | {f"{name}.png" for name in names}
     for path in drawn.parent.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG") and path.read_bytes().endswith(b"IEND\xaeB`\x82")
@@ -268,7 +264,6 @@ def test_a_different_protocol_raises_or_is_marked(tmp_path, not_drawn):
     assert f"‡ {BASE} was run under another protocol: steps is 50000, not 100000" in text
     assert text.count(f">{BASE} ‡</t") >= 4 and f"{FULL} ‡" not in text  # summary, games, runs, settings
     assert "se2+aet ‡ |" in page.with_name("table.md").read_text()
-    assert r"se2+aet \ddag{} &" in page.with_name("table.tex").read_text()
     rows = pd.read_csv(page.with_name("aggregates.csv")).dropna(subset="protocol_differs")
     assert set(rows["agent"]) == {BASE} and rows["protocol_differs"].str.startswith("steps is 50000").all()
 
@@ -423,7 +418,7 @@ def test_one_agent_one_game_one_seed(tmp_path, not_drawn):
     assert rows.at["IQM", "value"] == pytest.approx(20.7 / 35.3) and rows[["low", "high"]].isna().all(axis=None)
     assert "<b>" not in text
     found = all_figures(analyse(compare([folder], {}, True), 5))
-    assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves", "symmetry_losses"]
+    assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves"]
     assert "95%" not in "".join(p.caption for p in found)
     assert found[-1].caption.endswith("A single run each.")
 
@@ -461,8 +456,6 @@ def test_curves_are_over_fractions_of_the_steps_and_end_with_the_final_evaluatio
     assert fractions.tolist() == [0.5, 1.0] and curves.shape == (3, 3, 2)
     assert curves[..., -1] == pytest.approx(matrix(FULL))
     assert curves[0, 0, 0] == pytest.approx((-4.5 + 20.7) / 35.3)  # Pong, seed 0, half way
-    losses = symmetry_losses(comparison).query("game == 'Pong'")
-    assert losses["step"].tolist() == [5, 10] * 3 and (losses["value"] == 0.75).all()  # thousands: ends of twentieths
 
 
 def test_curves_of_many_points_and_of_points_that_coincide(tmp_path):
@@ -479,19 +472,6 @@ def test_curves_of_many_points_and_of_points_that_coincide(tmp_path):
     fractions, curves = normalized_curves(comparison)[FULL]
     assert fractions.tolist() == pytest.approx([number / 200 for number in range(1, 201)])
     assert curves.shape == (3, 3, 200) and curves[..., -1] == pytest.approx(matrix(FULL))
-
-
-def test_losses_between_those_logged_are_interpolated(tmp_path):
-    """Twentieths of 100,000 steps: seed 0 logs in the first and third, the other seeds from the second to the fourth."""
-
-    def change(result):
-        logged = {4_000: 1.0, 14_000: 3.0} if result["seed"] == 0 else {8_000: 5.0, 18_000: 7.0}
-        return result | {"losses": [{"step": step, "aet_loss": loss} for step, loss in logged.items()]}
-
-    folder = a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]}, change=change)
-    found = symmetry_losses(compare([folder], {}, False)).query("game == 'Pong'").groupby("seed")
-    assert found["step"].apply(list).tolist() == [[10, 15]] * 3
-    assert found["value"].apply(list).tolist() == [[2, 3], [5, 6], [5, 6]]
 
 
 def test_empty_figures_are_omitted(tmp_path):
@@ -511,8 +491,6 @@ def test_cells_are_escaped():
     table = make_table(["a_b", "50% & more"], [["x|y", "1\n± 2"], ["<z>", "3"]], [[False, True], [False, False]])
     lines = [re.sub(" +", " ", line) for line in to_markdown(table).splitlines()]
     assert lines[0] == "| a_b | 50% & more |" and lines[2] == r"| x\|y | **1** ± 2 |"
-    latex = to_latex(table)
-    assert r"a\_b & 50\% \& more \\" in latex and r"x|y & \bfseries 1 $\pm$ 2 \\" in latex
     assert "&lt;z&gt;" in to_html(table) and "<z>" not in to_html(table) and "<b>1</b><br><small>± 2</small>" in to_html(table)
 
 

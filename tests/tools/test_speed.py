@@ -102,7 +102,7 @@ def test_options():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, sizes, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, graph, sizes, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
         ("--largest 100", "--largest must be an integer >= 10000, got 100"),

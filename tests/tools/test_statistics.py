@@ -12,10 +12,8 @@ from sb3_eqr.benchmark.statistics import (
     average_score_profile,
     detectable_difference,
     games_above,
-    improvement_probabilities,
     iqm_differences,
     performance_profile,
-    probability_of_improvement,
     sample_efficiency,
     score_matrices,
 )
@@ -131,22 +129,6 @@ def test_profiles_match_rliable():
     np.testing.assert_allclose(found, [values["a"], *bands["a"]])
 
 
-def test_probability_of_improvement_matches_rliable():
-    rng = np.random.default_rng(0)
-    first, second = rng.integers(0, 4, (5, 6)) / 1.0, rng.integers(0, 4, (3, 6)) / 1.0  # with ties
-    assert probability_of_improvement(first, second) == pytest.approx(metrics.probability_of_improvement(first, second))
-    assert probability_of_improvement(np.array([[1.0], [3.0]]), np.array([[2.0], [1.0]])) == 2.5 / 4
-    found = improvement_probabilities({"a": second, "b": first}, "a", reps=40, seed=2)
-    np.random.seed(2)
-    _, ends = library.get_interval_estimates(
-        {"b": [first, second]}, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=40
-    )
-    assert found["agent"].tolist() == ["b"] and found["baseline"].tolist() == ["a"]
-    assert found.loc[0, ["low", "high"]].tolist() == pytest.approx(ends["b"][:, 0].tolist())
-    single = improvement_probabilities({"a": second[:1], "b": first}, "a", reps=5)
-    assert single[["low", "high"]].isna().all(axis=None) and improvement_probabilities({"a": first}, "a").empty
-
-
 def test_a_report_of_six_agents_takes_seconds():
     """The report's statistics for ten runs on five games with five points. rliable's loop takes minutes."""
     rng = np.random.default_rng(0)
@@ -157,7 +139,6 @@ def test_a_report_of_six_agents_takes_seconds():
         performance_profile(matrix, taus)
         average_score_profile(matrix, taus)
         sample_efficiency(rng.gamma(1.0, 1.0, (10, 5, 5)))
-    improvement_probabilities(agents, "0")
     iqm_differences(agents, "0")
     iqm_differences(agents, "1")
     assert time.process_time() - began < 10
