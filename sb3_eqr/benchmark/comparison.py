@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark.packed import read
-from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game
+from sb3_eqr.benchmark.reference import PUBLISHED_STEPS
 from sb3_eqr.benchmark.scores import read_runs, score_table
 from sb3_eqr.benchmark.selection import (
     choose_runs,
@@ -33,7 +33,6 @@ class Comparison:
     :param agents: agents of the benchmark; the first is the baseline
     :param scores: columns agent, game, seed, raw, score (normalised); the runs compared, of agents and references
     :param results: result.json of those runs
-    :param episodes: every episode of every finished run, as ``score_table`` returns them
     :param differing: agent -> how its protocol differs from the others', where the comparison was forced
     :param notes: sentences on what was left out and why
     """
@@ -46,7 +45,6 @@ class Comparison:
     agents: list[str]
     scores: pd.DataFrame
     results: list[dict[str, Any]]
-    episodes: pd.DataFrame
     differing: dict[str, str]
     notes: list[str]
 
@@ -146,24 +144,22 @@ def compare(
         agents=agents,
         scores=pd.DataFrame(),
         results=used,
-        episodes=score_table(results),
         differing=differing,
         notes=notes,
     )
     if comparison.human and not comparison.has_published:
         notes.append("Published scores are omitted, because they are for 100,000 steps.")
-    return dataclasses.replace(comparison, scores=_scores(comparison, references, suites))
+    return dataclasses.replace(comparison, scores=_scores(comparison, references))
 
 
-def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suites: list[Suite]) -> pd.DataFrame:
+def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path]) -> pd.DataFrame:
     """:return: columns agent, game, seed, raw, score; adds a note for each reference with unused runs"""
     final = score_table(comparison.results).query("kind == 'final'")
     tables = [final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()]
-    known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
     for name, path in references.items():
         if name in comparison.agents:
             raise ValueError(f"--reference must have a name that no agent has, got {name!r}. Rename it.")
-        runs = read_runs(path, name, comparison.games, known)
+        runs = read_runs(path, name, comparison.games)
         comparison.notes.extend([runs.attrs["note"]] if "note" in runs.attrs else [])
         tables.append(runs.rename(columns={"score": "raw"}))
     table = pd.concat(tables, ignore_index=True)
@@ -224,7 +220,7 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
         if game not in bounds:
             raise ValueError(
                 f"{game} has no bounds for normalisation in {suites[0].name}, which has them for "
-                f"{', '.join(bounds) or 'no game'}.{nearest(game, {plain_game(known): known for known in bounds})} "
+                f"{', '.join(bounds) or 'no game'}. "
                 "Correct the name, or add the game under normalisation: scores in suite.yml."
             )
     return bounds

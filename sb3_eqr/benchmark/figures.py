@@ -93,30 +93,25 @@ def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
-    taus = thresholds(analysis.matrices)
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
-    kinds = {"runs": statistics.performance_profile, "games": statistics.average_score_profile}
-    for ax, (what, profile) in zip(axes, kinds.items(), strict=True):
-        found = {analysis.comparison.label(a): profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
-        plot_utils.plot_performance_profiles(
-            {agent: value for agent, (value, _, _) in found.items()},
-            taus,
-            {agent: ends for agent, (_, *ends) in found.items()},
-            ax=ax,
-            colors={agent: look.color for agent, look in style.items()},
-            linestyles={agent: look.line for agent, look in style.items()},
-            xlabel=f"score τ ({analysis.comparison.unit})",
-            ylabel=f"fraction of {what} above τ",
-            **SIZES,
-        )
-        for line, look in zip(ax.get_lines(), style.values(), strict=True):
-            line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
-    _legend(figure, style)
-    caption = (
-        "Fraction of runs (left) and of games, by their mean over runs (right), that score above τ, as Figure 4 of the EqR "
-        f"paper. Higher curves are better.{_bands(analysis, 'Bands are pointwise')}"
+    taus, label = thresholds(analysis.matrices), analysis.comparison.label
+    figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    found = {label(a): statistics.performance_profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
+    plot_utils.plot_performance_profiles(
+        {agent: value for agent, (value, _, _) in found.items()},
+        taus,
+        {agent: ends for agent, (_, *ends) in found.items()},
+        ax=ax,
+        colors={agent: look.color for agent, look in style.items()},
+        linestyles={agent: look.line for agent, look in style.items()},
+        xlabel=f"score τ ({analysis.comparison.unit})",
+        ylabel="fraction of runs above τ",
+        **SIZES,
     )
-    return ReportFigure("profiles", "Performance profiles", caption, figure)
+    for line, look in zip(ax.get_lines(), style.values(), strict=True):
+        line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
+    _legend(figure, style)
+    caption = "Fraction of runs that score above τ, as Figure 4 of the EqR paper. Higher curves are better."
+    return ReportFigure("profiles", "Performance profiles", caption + _bands(analysis, "Bands are pointwise"), figure)
 
 
 def _aggregates(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:

@@ -41,7 +41,7 @@ def write_report(
     reps: int = REPS,
 ) -> pathlib.Path:
     """
-    Write report.html, its figures as PNG, table.md, scores.csv and aggregates.csv.
+    Write report.html, its figures as PNG, table.md and aggregates.csv.
 
     :param folders: folders of benchmarks, with suite.yml and runs/, or files of ``sb3-eqr benchmark pack``
     :param references: name -> JSON file with the runs of another method, game -> raw scores
@@ -60,8 +60,7 @@ def write_report(
     table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
     files = {f"{figure.name}.png": to_png(figure) for figure in figures}
     files["table.md"] = _markdown(analysis, table)
-    for name, data in (("scores.csv", comparison.episodes), ("aggregates.csv", aggregates_file(analysis))):
-        files[name] = data.to_csv(index=False).encode()
+    files["aggregates.csv"] = aggregates_file(analysis).to_csv(index=False).encode()
     before, shown = notes(analysis), conclusion(analysis)
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined

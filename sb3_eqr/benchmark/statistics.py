@@ -101,7 +101,7 @@ def aggregate(matrices: Mapping[str, np.ndarray], reps: int = REPS, seed: int = 
 
 def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """
-    The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 (a) of EqR).
+    The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 of EqR).
 
     :param matrix: (runs, games), normalised scores
     :param thresholds: (n,), in the unit of the scores
@@ -112,11 +112,6 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
         return np.stack([(scores > threshold).mean(axis=(-2, -1)) for threshold in thresholds], axis=-1)
 
     return estimate(fractions, matrix, reps=reps, seed=seed)
-
-
-def average_score_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
-    """As :func:`performance_profile`, for the fraction of games whose mean over runs is above a threshold (Fig. 4 (b))."""
-    return estimate(lambda scores: (scores.mean(axis=-2)[..., None] > thresholds).mean(axis=-2), matrix, reps=reps, seed=seed)
 
 
 def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:

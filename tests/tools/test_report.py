@@ -198,12 +198,10 @@ def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
 
 def test_the_files_of_a_report(drawn, report):
     names = {"profiles", "aggregates", "sample_efficiency", "learning_curves"}
-    data = {"report.html", "table.md", "scores.csv", "aggregates.csv"}
+    data = {"report.html", "table.md", "aggregates.csv"}
     assert {path.name for path in drawn.parent.iterdir()} == data | {f"{name}.png" for name in names}
     for path in drawn.parent.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG") and path.read_bytes().endswith(b"IEND\xaeB`\x82")
-    scores = pd.read_csv(report.with_name("scores.csv"))
-    assert len(scores) == 27 * (2 + 1 + 2 + 1) and set(scores["kind"]) == {"curve", "final", "training"}
 
 
 def test_the_page_is_self_contained(drawn):
@@ -309,9 +307,7 @@ def test_nothing_to_compare(tmp_path):
 
 
 def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"Boxng has no bounds for normalisation .* Pong, Boxing, Krull\. Did you mean 'Boxing'\?"
-    ):
+    with pytest.raises(ValueError, match=r"Boxng has no bounds for normalisation .* Pong, Boxing, Krull\. Correct the name"):
         compare([a_benchmark(tmp_path / "a", {"dqn": {"Pong": [1.0]}}, change=lambda r: r | {"game": "Boxng"})], {}, False)
 
     one = {"dqn": {"Pong": [1.0]}}

@@ -9,7 +9,6 @@ from rliable import library, metrics
 
 from sb3_eqr.benchmark.statistics import (
     aggregate,
-    average_score_profile,
     detectable_difference,
     games_above,
     iqm_differences,
@@ -116,7 +115,6 @@ def test_profiles_by_hand():
     taus = np.array([-1.0, 0.5, 0.8, 2.0])
     value, low, high = performance_profile(matrix, taus, reps=20)
     assert value.tolist() == [1, 0.75, 0.25, 0] and (low <= value).all() and (value <= high).all() and low[1] < high[1]
-    assert average_score_profile(matrix, taus, reps=20)[0].tolist() == [1, 0.5, 0, 0]
     _, low, high = performance_profile(np.ones((1, 2)), taus, reps=20)
     assert np.isnan(low).all() and np.isnan(high).all()
 
@@ -137,7 +135,6 @@ def test_a_report_of_six_agents_takes_seconds():
     aggregate(agents)
     for matrix in agents.values():
         performance_profile(matrix, taus)
-        average_score_profile(matrix, taus)
         sample_efficiency(rng.gamma(1.0, 1.0, (10, 5, 5)))
     iqm_differences(agents, "0")
     iqm_differences(agents, "1")
