@@ -14,6 +14,7 @@ from sb3_eqr.benchmark.suites import Suite, merge, read_suite
 from sb3_eqr.common.saving.files import atomic_write
 
 SUFFIX = ".jsonl.xz"
+NEEDED = ("agent", "game", "seed", "protocol", "entry", "evaluations", "training", "losses")  # in every row
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
 
 
@@ -41,8 +42,11 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
 
 def _read_row(path: pathlib.Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except ValueError as error:
+        row = dict(json.loads(path.read_text(encoding="utf-8")))
+        if missing := [key for key in NEEDED if key not in row]:
+            raise ValueError(f"without {', '.join(missing)}")
+        return row
+    except (ValueError, TypeError) as error:
         raise ValueError(
             f"{path} must be the result of a run, got a damaged file ({error}). Remove it and run it again."
         ) from error

@@ -21,7 +21,6 @@ from sb3_eqr.benchmark.tables import (
     game_table,
     make_table,
     number,
-    summary_table,
     to_html,
     to_markdown,
 )
@@ -71,7 +70,6 @@ def write_report(
         lead=_lead(comparison),
         conclusion=shown,
         notes=before,
-        summary=_html(summary_table(comparison, analysis.aggregates, analysis.matrices, reps)),
         figures=[(figure, files[f"{figure.name}.png"]) for figure in figures],
         human=comparison.human,
         raw=comparison.is_raw,

@@ -112,41 +112,15 @@ def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame
     return pd.DataFrame(rows, columns=["label", "metric", "value"])
 
 
-def aggregate_rows(
-    comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray]
-) -> dict[str, list[str]]:
-    """
-    :param aggregates: columns agent, metric, value, low, high
-    :param matrices: agent -> (runs, games), normalised scores
-    :return: name of the row -> a string per agent
-    """
-    by_agent = aggregates.set_index(["agent", "metric"])
-    rows = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in comparison.metrics}
-    if not comparison.is_raw:
-        rows[comparison.above_one] = [str(games_above(matrix)) for matrix in matrices.values()]
-    rows["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
-    return rows
-
-
-def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], reps: int) -> Table:
-    """The aggregates of the runs compared, a row per agent; for the parameters see :func:`aggregate_rows`."""
-    columns = aggregate_rows(comparison, aggregates, matrices)
-    rows = [
-        [comparison.label(agent), str(len(matrix)), *(texts[place] for texts in columns.values())]
-        for place, (agent, matrix) in enumerate(matrices.items())
-    ]
-    best = distinct_best(matrices, comparison.differing, reps)
-    bold = [[column == 2 and is_best for column in range(len(rows[0]))] for is_best in best]
-    return make_table(["agent", "runs", *columns], rows, bold)
-
-
 def game_table(
     comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], means: pd.DataFrame, reps: int
 ) -> Table:
     """
     A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below.
 
-    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`; for the other parameters see :func:`aggregate_rows`
+    :param aggregates: columns agent, metric, value, low, high
+    :param matrices: agent -> (runs, games), normalised scores
+    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`
     """
     names = (RANDOM, HUMAN) if comparison.human else () if comparison.is_raw else ("score 0", "score 1")
     header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
@@ -164,7 +138,11 @@ def game_table(
         is_best = distinct_best(of_game, comparison.differing, reps)
         bold.append([False] * (1 + len(names)) + is_best + [False] * len(means.columns))
     of_means = aggregate_means(means, comparison).set_index(["label", "metric"])["value"]
-    for name, texts in aggregate_rows(comparison, aggregates, matrices).items():
+    by_agent = aggregates.set_index(["agent", "metric"])
+    last = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in comparison.metrics}
+    last |= {} if comparison.is_raw else {comparison.above_one: [str(games_above(matrix)) for matrix in matrices.values()]}
+    last["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
+    for name, texts in last.items():
         ends = ("1", "0") if name == "optimality gap" else ("0", "1") if name in METRICS else ("", "")
         metric = "above 1" if name == comparison.above_one else name
         known = [of_means.get((method, metric), np.nan) for method in means]

@@ -285,11 +285,11 @@ def write_a_benchmark(folder):
     """One finished run, with the fields that ``load_scores`` reads."""
     evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
     training = {"step": [100], "score": [100.0], "length": [100]}
-    names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}
+    names, others = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}, {"protocol": {}, "entry": {}, "losses": []}
     run = folder / "runs" / "eqr_qrdqn" / "CartPole-v1" / "0"
     run.mkdir(parents=True)
     write_suite(load_suite("smoke"), folder / "suite.yml")
-    (run / "result.json").write_text(json.dumps({**names, "evaluations": [evaluation], "training": training}))
+    (run / "result.json").write_text(json.dumps({**names, **others, "evaluations": [evaluation], "training": training}))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
