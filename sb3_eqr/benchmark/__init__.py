@@ -4,8 +4,9 @@ scores, ``load_scores`` those of a benchmark.
 
 ``__main__`` parses the command line. For ``run``, ``suites`` and ``agents`` look up the names, ``runs`` plans a folder per
 run, ``dispatch`` executes the runs in processes and ``cluster`` on Ray, ``training`` executes one, with ``evaluation``. For
-``report``, ``packed`` reads the runs' output and ``scores`` their scores, ``selection`` and ``comparison`` choose what can be compared, ``reference`` adds published scores,
-``statistics`` and ``analysis`` compute the results and put them into words, ``tables``, ``figures`` and ``report`` write them.
+``report``, ``packed`` reads the runs and ``scores`` their scores, ``selection`` and ``comparison`` choose what can be compared,
+``reference`` adds published scores, ``statistics`` and ``analysis`` compute the results and put them into words, ``tables``,
+``figures`` and ``report`` write them.
 """
 
 import importlib
