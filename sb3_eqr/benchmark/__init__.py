@@ -3,9 +3,10 @@ The benchmark: ``sb3-eqr benchmark`` trains, evaluates and reports (docs/benchma
 scores, ``load_scores`` those of a benchmark.
 
 ``__main__`` parses the command line. For ``run``, ``suites`` and ``agents`` look up the names, ``runs`` plans a folder per
-run, ``dispatch`` submits the runs to Ray, ``training`` executes one, with ``evaluation``. For ``report``, ``scores`` reads
-the runs' output, ``selection`` and ``comparison`` choose what can be compared, ``reference`` adds published scores,
-``statistics`` and ``analysis`` compute the results and put them into words, ``tables``, ``figures`` and ``report`` write them.
+run, ``dispatch`` executes the runs in processes and ``cluster`` on Ray, ``training`` executes one, with ``evaluation``. For
+``report``, ``packed`` reads the runs, ``scores`` their scores, ``selection`` and ``comparison`` choose what to compare,
+``reference`` adds published scores, ``statistics`` and ``analysis`` compute the results and put them into words, ``tables``,
+``figures`` and ``report`` write them.
 """
 
 import importlib

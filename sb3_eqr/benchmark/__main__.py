@@ -1,4 +1,4 @@
-"""The command line: ``sb3-eqr benchmark run|status|report``. The help needs none of the extra's packages."""
+"""The command line: ``sb3-eqr benchmark run|status|report|pack``. The help needs none of the extra's packages."""
 
 import argparse
 import importlib
@@ -14,7 +14,7 @@ def absolute(path: str) -> pathlib.Path:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """:return: the parser of the three commands"""
+    """:return: the parser of the commands"""
     parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents by the scores of several seeds.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command resumes where it stopped")
@@ -27,12 +27,20 @@ def make_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")
     run.add_argument("--games", nargs="+", help="a subset of the suite's games (default: all)")
-    run.add_argument("--seeds", type=int, help=f"number of seeds, counted from 0 (default: {SEEDS})")
+    run.add_argument("--seeds", help=f"number of seeds, or the seeds themselves, such as 1,3 (default: {SEEDS})")
+    run.add_argument("--first-seed", type=int, default=0, help="where the number of seeds counts from (default: 0)")
     run.add_argument("--steps", type=int, help="training steps instead of the suite's")
-    run.add_argument("--device", default="auto", help="PyTorch device (default: the GPU with --gpus-per-run, else cpu)")
-    run.add_argument("--address", help="address of a Ray cluster that can access the folder (default: this machine)")
+    run.add_argument("--episodes", type=int, help="episodes of the final evaluation instead of the suite's")
+    run.add_argument("--device", default="auto", help="PyTorch device (default: cpu)")
+    run.add_argument("--jobs", type=int, help="runs at once (default: the cores divided by --cpus-per-run)")
     run.add_argument("--cpus-per-run", type=float, default=1.0, help="CPUs and PyTorch threads per run (default: 1)")
-    run.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs per run, such as 0.1 (default: 0)")
+    run.add_argument(
+        "--stop-after", type=float, metavar="SECONDS", help="then checkpoint and stop; the same command continues"
+    )
+    run.add_argument(
+        "--ray", nargs="?", const="local", metavar="ADDRESS", help="run on Ray: on the cluster at ADDRESS, or on this machine"
+    )
+    run.add_argument("--gpus-per-run", type=float, default=0.0, help="with --ray: GPUs per run, such as 0.1 (default: 0)")
     run.add_argument("--save-models", action="store_true", help="save each trained agent in models/ of its run, for enjoy -f")
     run.add_argument(
         "--checkpoint-every",
@@ -44,7 +52,13 @@ def make_parser() -> argparse.ArgumentParser:
     status = commands.add_parser("status", help="progress of a benchmark")
     status.add_argument("folder", type=pathlib.Path)
     report = commands.add_parser("report", help="write scores, tables, figures and report.html")
-    report.add_argument("folders", nargs="+", type=pathlib.Path, metavar="folder", help="folder of a benchmark, or several")
+    report.add_argument(
+        "folders",
+        nargs="+",
+        type=pathlib.Path,
+        metavar="folder",
+        help="folder of a benchmark or file of packed runs, or several",
+    )
     report.add_argument(
         "--reference",
         action="append",
@@ -53,11 +67,18 @@ def make_parser() -> argparse.ArgumentParser:
         help="scores of your own: a JSON file, game -> scores of runs",
     )
     report.add_argument("--agents", nargs="+", default=[], help="a subset of the agents (default: all)")
-    report.add_argument("--baseline", help="the agent that the others are compared with (default: the first stock one)")
+    report.add_argument(
+        "--baseline", help="the agent that the others are compared with (default: a stock one, or one without EqR)"
+    )
     report.add_argument(
         "--force", action="store_true", help="compare despite different protocols or missing games; the report marks them"
     )
-    report.add_argument("--output", type=pathlib.Path, help="output folder (default: FOLDER/report)")
+    report.add_argument(
+        "--output", type=pathlib.Path, help="output folder (default: FOLDER/report, or NAME_report for a file)"
+    )
+    pack = commands.add_parser("pack", help="add the finished and stopped runs of a benchmark to one compressed file")
+    pack.add_argument("folder", type=pathlib.Path)
+    pack.add_argument("file", type=pathlib.Path, help="NAME.jsonl.xz")
     return parser
 
 

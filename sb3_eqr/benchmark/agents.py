@@ -2,6 +2,7 @@
 
 import inspect
 import pathlib
+import re
 from typing import Any, NamedTuple
 
 import rl_zoo3
@@ -40,8 +41,8 @@ def find_agent(text: str) -> Agent:
     """
     :param text: ALGO or ALGO:ENTRIES. ALGO alone uses RL Zoo's hyperparameters for a stock algorithm, ours for an EqR agent.
         ENTRIES is "stock" (zoo_hyperparams/stock), "off" (an EqR agent without group and auxiliary losses), the name of one
-        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file: entries, or
-        ``base``, the ENTRIES or file to start from, and ``changes``
+        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file with entries,
+        or with ``base``, the ENTRIES or file to start from, and ``changes``; FILE:NAME is one of several of these in a file
     :raises ValueError: for an unknown algorithm or file, with the nearest name
     """
     register()
@@ -54,10 +55,10 @@ def find_agent(text: str) -> Agent:
         return Agent(algo, algo, own)
     if entries == OFF and algo in AGENTS:
         return Agent(text, algo, files[algo], {"prediction_depth": 0, "policy_kwargs": {"group": None}})
-    if entries.endswith((".yml", ".yaml")):
-        if not pathlib.Path(entries).is_file():
-            raise ValueError(f"--agents: {text!r}: there is no file {entries}")
-        return _agent_of_file(algo, pathlib.Path(entries).resolve())
+    if match := re.fullmatch(r"(.+\.ya?ml)(?::(.+))?", entries):
+        if not pathlib.Path(match[1]).is_file():
+            raise ValueError(f"--agents: {text!r}: there is no file {match[1]}")
+        return _agent_of_file(algo, pathlib.Path(match[1]).resolve(), match[2])
     name = f"{STOCK}/{algo}" if entries == STOCK else entries
     legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
     longer = [key for key in legal if key.startswith(entries)]
@@ -74,20 +75,27 @@ def find_agent(text: str) -> Agent:
     return Agent(f"{algo}:{entries}", algo, files[name])
 
 
-def _agent_of_file(algo: str, file: pathlib.Path) -> Agent:
-    """The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries."""
-    name, found = f"{algo}:{file.stem}", yaml.safe_load(file.read_text(encoding="utf-8"))
-    if not isinstance(found, dict) or found.keys() != {"base", "changes"}:
-        return Agent(name, algo, file)
+def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Agent:
+    """
+    The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries.
+
+    :param name: the name of one of several agents with ``base`` and ``changes`` in the file
+    """
+    found = yaml.safe_load(file.read_text(encoding="utf-8"))
+    if name is not None:
+        if name not in found:
+            raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, map(str, found))}")
+        found = found[name]
+    label = f"{algo}:{name or file.stem}"
+    if not isinstance(found, dict) or "base" not in found or found.keys() - {"base", "changes"}:
+        return Agent(label, algo, file)
     beside = file.parent / str(found["base"])
     base = _agent_of_file(algo, beside) if beside.is_file() else find_agent(f"{algo}:{found['base']}")
-    return Agent(name, algo, base.file, merged(base.changes, found["changes"]))
+    return Agent(label, algo, base.file, merged(base.changes, found.get("changes", {})))
 
 
 def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:
     """
-    :param agent: the agent
-    :param entry: its hyperparameters
     :return: the defaults of the algorithm for what the entry leaves out, and of its policy, as far as they are plain data:
         where they change between versions, the same entry makes another agent
     """

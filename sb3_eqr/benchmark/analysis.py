@@ -11,6 +11,7 @@ import pandas as pd
 from sb3_eqr.benchmark import statistics
 from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import SHOWN, PublishedMethod, load_reference, published_means
+from sb3_eqr.benchmark.statistics import MIN_RUNS
 from sb3_eqr.benchmark.tables import aggregate_means, distinct_best, number
 
 FEW_RUNS = 5  # with fewer, the intervals of the percentile bootstrap are far too narrow
@@ -25,7 +26,6 @@ class Analysis:
     :param means: rows games, columns published methods, raw mean scores
     :param differences: differences of IQMs from the first agent and from the best, see
         :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
-    :param improvements: over the first agent, see :func:`~sb3_eqr.benchmark.statistics.improvement_probabilities`
     :param reps: bootstrap samples behind all intervals
     """
 
@@ -34,7 +34,6 @@ class Analysis:
     aggregates: pd.DataFrame
     means: pd.DataFrame
     differences: pd.DataFrame
-    improvements: pd.DataFrame
     reps: int
 
 
@@ -56,7 +55,6 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
         statistics.aggregate(matrices, reps),
         published(comparison, SHOWN),
         differences,
-        statistics.improvement_probabilities(matrices, baseline, reps),
         reps,
     )
 
@@ -99,7 +97,8 @@ def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
     size, least = _distinct(abs(difference), detectable)
     side = "higher" if difference > 0 else "lower"
     if math.isnan(detectable):
-        chance = "a single run does not show how much of that is chance"
+        few = min(row["runs"], row["baseline_runs"])
+        chance = f"{counted(few, 'run')} per game {'does' if few == 1 else 'do'} not show how much of that is chance"
         return f"The IQM of {agent} is {size} {side} than that of {other}: {chance}."
     runs = str(row["runs"]) if row["runs"] == row["baseline_runs"] else f"{row['runs']} and {row['baseline_runs']}"
     shown = f"{runs} runs on {counted(row['games'], 'game')} can only detect differences above {least}"
@@ -135,7 +134,7 @@ def notes(analysis: Analysis) -> list[str]:
     if few := [agent for agent, matrix in analysis.matrices.items() if 1 < len(matrix) < FEW_RUNS]:
         found.append(
             f"{', '.join(few)}: fewer than {FEW_RUNS} runs per game. Bootstrap intervals of so few runs are too narrow, so "
-            "intervals that do not overlap show nothing; the conclusion allows for it."
+            f"intervals that do not overlap show nothing; the conclusion allows for it, and gives none below {MIN_RUNS} runs."
         )
     return found
 
@@ -146,8 +145,8 @@ def table_notes(analysis: Analysis) -> list[str]:
     found = [
         "Raw scores: mean ± standard deviation over runs. "
         "Bold: significantly better than every other agent with the same protocol.",
-        "The last rows are aggregates of normalised scores over all runs and games, with 95% intervals; "
-        f"{comparison.above_one} are games with a mean above 1.",
+        f"The last rows are aggregates of {'raw' if comparison.is_raw else 'normalised'} scores over all runs and games, with "
+        f"95% intervals{'' if comparison.is_raw else f'; {comparison.above_one} are games with a mean above 1'}.",
     ]
     if len(analysis.means.columns):
         sources = load_reference().drop_duplicates("method").set_index("method")["source"]
@@ -160,6 +159,7 @@ def aggregates_file(analysis: Analysis) -> pd.DataFrame:
     comparison = analysis.comparison
     above = [(agent, comparison.above_one, statistics.games_above(matrix)) for agent, matrix in analysis.matrices.items()]
     own = pd.concat([analysis.aggregates, pd.DataFrame(above, columns=["agent", "metric", "value"])], ignore_index=True)
+    own = own[own["metric"].isin([*comparison.metrics, *([] if comparison.is_raw else [comparison.above_one])])]
     own["runs"] = [len(analysis.matrices[agent]) for agent in own["agent"]]
     own["from"] = "runs"
     known = aggregate_means(analysis.means, comparison).rename(columns={"label": "agent"})

@@ -1,14 +1,17 @@
-"""The commands ``sb3-eqr benchmark run|status|report``, apart from the parser, whose help needs none of these imports."""
+"""The commands ``sb3-eqr benchmark run|status|report|pack``, apart from the parser, whose help needs none of these imports."""
 
 import argparse
+import os
 import pathlib
 import shlex
 import sys
+import time
+from typing import Any
 
-import torch as th
 from rich.console import Console
 
-from sb3_eqr.benchmark.dispatch import make_table, run_benchmark
+from sb3_eqr.benchmark.dispatch import Processes, finish, make_table
+from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
 from sb3_eqr.benchmark.suites import choose, load_suite
@@ -18,25 +21,50 @@ from sb3_eqr.zoo.checks import check_device, fail
 
 def check_resources(args: argparse.Namespace) -> str:
     """
-    :param args: arguments of ``run``
     :return: the device of every run
     :raises ValueError: for resources that are invalid or not available
     """
-    if args.cpus_per_run <= 0 or args.gpus_per_run < 0:
-        found = f"{args.cpus_per_run} and {args.gpus_per_run}"
-        raise ValueError(f"--cpus-per-run must be > 0 and --gpus-per-run >= 0, got {found}.")
-    if args.checkpoint_every < 0:
-        raise ValueError(f"--checkpoint-every must be >= 0 seconds, got {args.checkpoint_every}.")
-    if args.address is None and args.gpus_per_run > th.cuda.device_count():  # before Ray is started
+    for flag, is_right, needed in (
+        ("cpus_per_run", args.cpus_per_run > 0, "> 0"),
+        ("gpus_per_run", args.gpus_per_run >= 0, ">= 0"),
+        ("checkpoint_every", args.checkpoint_every >= 0, ">= 0 seconds"),
+        ("stop_after", args.stop_after is None or args.stop_after > 0, "> 0 seconds"),
+        ("jobs", args.jobs is None or args.jobs >= 1, ">= 1"),
+        ("steps", args.steps is None or args.steps >= 1, ">= 1"),
+        ("episodes", args.episodes is None or args.episodes >= 1, ">= 1"),
+    ):
+        if not is_right:
+            raise ValueError(f"--{flag.replace('_', '-')} must be {needed}, got {getattr(args, flag):g}.")
+    if args.ray is None and args.gpus_per_run:
         raise ValueError(
-            f"--gpus-per-run must be <= {th.cuda.device_count()}, the GPUs of this machine, got {args.gpus_per_run:g}."
+            f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU."
         )
+    if args.ray is not None and args.jobs is not None:
+        raise ValueError("--jobs cannot be given with --ray, which starts as many runs as its CPUs and GPUs allow.")
     device = "cpu" if args.device == "auto" and args.gpus_per_run == 0 else args.device
-    if args.address is None:  # the machines of a cluster may have other devices
+    if args.ray is None:  # the machines of a cluster may have other devices
         check_device(device)
-    if device.startswith("cuda") and args.gpus_per_run == 0:
-        raise ValueError(f"--gpus-per-run must be > 0 with --device {device}, got 0. 0.1 puts ten runs on a GPU.")
+    elif device.startswith("cuda") and args.gpus_per_run == 0:
+        raise ValueError(f"--gpus-per-run must be > 0 with --ray --device {device}, got 0. 0.1 puts ten runs on a GPU.")
     return device
+
+
+def make_pool(args: argparse.Namespace, settings: Settings) -> Any:
+    """
+    :param args: arguments of ``run``
+    :param settings: settings of all runs
+    :return: where the runs are executed
+    :raises ImportError: if Ray is asked for and not installed
+    """
+    if args.ray is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return Processes(settings, args.jobs or max(int(cores / args.cpus_per_run), 1))
+    try:
+        from sb3_eqr.benchmark.cluster import Cluster
+    except ImportError as error:
+        raise ImportError(f'--ray: {error}. Run pip install ".[cluster]" in a clone of the repository') from error
+    print("Starting Ray ..." if args.ray == "local" else "Connecting to Ray ...", flush=True)
+    return Cluster(settings, args.ray, args.cpus_per_run, args.gpus_per_run)
 
 
 def _command() -> str:
@@ -50,20 +78,33 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
     :raises ValueError: for invalid arguments
     """
     if args.suite is None and args.agents is None:
-        for name in ("suite_file", "games", "seeds", "steps"):
-            if getattr(args, name) is not None:
+        for name in ("suite_file", "games", "seeds", "first_seed", "steps", "episodes"):
+            if getattr(args, name):
                 flag = f"--{name.replace('_', '-')}"
                 raise ValueError(f"{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
         return with_present_defaults(read_plan(args.folder))
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")
-    if args.steps is not None and args.steps < 1:
-        raise ValueError(f"--steps must be >= 1, got {args.steps}.")
-    suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps)
-    n_seeds, command = args.default_seeds if args.seeds is None else args.seeds, _command()
-    runs = plan_runs(args.folder, suite, args.agents, n_seeds, command)
+    suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps, args.episodes)
+    runs = plan_runs(
+        args.folder, suite, args.agents, read_seeds(args.seeds or str(args.default_seeds), args.first_seed), _command()
+    )
     write_plan(args.folder, suite, runs)
     return runs
+
+
+def read_seeds(text: str, first: int) -> list[int]:
+    """
+    :param text: a number of seeds, or seeds separated by commas
+    :param first: the first seed, where ``text`` is a number of them
+    :raises ValueError: for anything else, or a seed that is given twice
+    """
+    found = [int(part) if part.isdecimal() else -1 for part in text.split(",")]
+    if min(found) < 0 or len(set(found)) < len(found) or (len(found) == 1 and found[0] == 0) or first < 0:
+        raise ValueError(f"--seeds must be >= 1, or different seeds >= 0 such as 1,3; got {text} from --first-seed {first}.")
+    if len(found) > 1 and first:
+        raise ValueError(f"--first-seed needs a number of seeds, got --seeds {text}. Leave it out.")
+    return found if len(found) > 1 else list(range(first, first + found[0]))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -73,22 +114,34 @@ def run(args: argparse.Namespace) -> int:
     runs = make_plan(args)
     for note in never_learn([planned.description() for planned in runs]):
         print(f"Note: {note}")
-    threads = max(int(args.cpus_per_run), 1)
     settings = Settings(
         device=device,
-        n_threads=threads,
+        n_threads=max(int(args.cpus_per_run), 1),
         checkpoint_seconds=args.checkpoint_every,
         gym_packages=args.gym_packages,
         save_models=args.save_models,
+        stop_at=None if args.stop_after is None else time.time() + args.stop_after,
     )
-    console = Console()
+    waiting = [planned for planned in runs if planned.state().name != "done"]
+    if len(waiting) < len(runs):
+        print(f"{len(runs) - len(waiting)} of {len(runs)} runs are already finished.")
+    console, failed = Console(), []
     if not console.is_terminal:  # which shows a table that changes
         print(f"Progress: sb3-eqr benchmark status {shlex.quote(str(args.folder))}", flush=True)
-    failed = run_benchmark(runs, settings, args.address, args.cpus_per_run, args.gpus_per_run, console)
+    if waiting:
+        pool = make_pool(args, settings)
+        try:
+            failed = finish(pool, runs, waiting, settings, console)
+        finally:
+            pool.close()
     for lost in failed:
         print(f"failed: {lost.label}: {lost.folder / ERROR}")
     if failed:
         print("The same command retries them from their last checkpoints.")
+    elif left := sum(planned.state().name != "done" for planned in runs):
+        print(
+            f"Stopped after {args.stop_after:g} seconds: {left} of {len(runs)} runs are left. The same command continues them."
+        )
     else:
         print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
     return 1 if failed else 0
@@ -116,16 +169,23 @@ def report(args: argparse.Namespace) -> int:
         if not (name and separator and path):
             raise ValueError(f"--reference must be NAME=FILE, got {text!r}.")
         references[name] = pathlib.Path(path)
-    output = args.output or args.folders[0] / "report"
+    first = args.folders[0]
+    output = args.output or (pathlib.Path(first.name.partition(".")[0] + "_report") if first.is_file() else first / "report")
     path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, _command())
     print(f"Written: {path}")
+    return 0
+
+
+def pack_runs(args: argparse.Namespace) -> int:
+    """:return: exit status"""
+    print(f"{pack(args.folder, args.file)} runs in {args.file}")
     return 0
 
 
 def execute(args: argparse.Namespace) -> None:
     """Run a command and exit with its status, or with a message and status 2 if the user has to do something."""
     try:
-        sys.exit({"run": run, "status": status, "report": report}[args.command](args))
+        sys.exit({"run": run, "status": status, "report": report, "pack": pack_runs}[args.command](args))
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:

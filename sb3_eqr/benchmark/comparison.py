@@ -8,10 +8,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_eqr.benchmark.reference import PUBLISHED_STEPS, load_reference, nearest, plain_game
-from sb3_eqr.benchmark.scores import load_results, read_runs, score_table
-from sb3_eqr.benchmark.selection import choose_runs, never_learn, protocol_differences, settings_differences
-from sb3_eqr.benchmark.suites import Suite, nearest_name, read_suite
+from sb3_eqr.benchmark.packed import read
+from sb3_eqr.benchmark.reference import PUBLISHED_STEPS
+from sb3_eqr.benchmark.scores import read_runs, score_table
+from sb3_eqr.benchmark.selection import (
+    choose_runs,
+    learns_latent_model,
+    never_learn,
+    protocol_differences,
+    settings_differences,
+)
+from sb3_eqr.benchmark.statistics import METRICS
+from sb3_eqr.benchmark.suites import RAW, Suite, nearest_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +33,6 @@ class Comparison:
     :param agents: agents of the benchmark; the first is the baseline
     :param scores: columns agent, game, seed, raw, score (normalised); the runs compared, of agents and references
     :param results: result.json of those runs
-    :param episodes: every episode of every finished run, as ``score_table`` returns them
     :param differing: agent -> how its protocol differs from the others', where the comparison was forced
     :param notes: sentences on what was left out and why
     """
@@ -38,7 +45,6 @@ class Comparison:
     agents: list[str]
     scores: pd.DataFrame
     results: list[dict[str, Any]]
-    episodes: pd.DataFrame
     differing: dict[str, str]
     notes: list[str]
 
@@ -46,6 +52,16 @@ class Comparison:
     def human(self) -> bool:
         """Whether a normalised score of 1 is a human tester's, as for published Atari scores."""
         return self.unit.startswith("human-normali")
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether scores are not normalised: then 0 and 1 mean nothing."""
+        return self.unit == RAW
+
+    @property
+    def metrics(self) -> list[str]:
+        """The metrics that mean something."""
+        return [metric for metric in METRICS if metric != "optimality gap" or not self.is_raw]
 
     @property
     def above_one(self) -> str:
@@ -91,21 +107,26 @@ def compare(
     :param references: name -> file of runs, see :func:`~sb3_eqr.benchmark.scores.read_runs`
     :param force: also compare agents with different protocols or games
     :param agents: the agents to compare; empty: all
-    :param baseline: the agent that the others are compared with; ``None``: the first stock one, or else the first
+    :param baseline: the agent that the others are compared with; ``None``: the first stock one, or else the first without EqR
     :return: what the folders have in common
     :raises ValueError: if they have nothing in common, or comparing it would mislead
     """
     if not folders:
         raise ValueError("folders must be at least one benchmark folder, got none.")
-    suites = [_read_suite(folder) for folder in folders]
-    results = _load(folders, [*agents, *([baseline] if baseline and agents else [])])
+    found = {folder: read(pathlib.Path(folder)) for folder in folders}
+    suites = [suite for suite, _ in found.values()]
+    rows = {folder: [row for row in rows if "stopped_at" not in row] for folder, (_, rows) in found.items()}
+    results = _load(rows, [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
     games, chosen, notes = choose_runs(results, list(dict.fromkeys(g for suite in suites for g in suite.games)), force)
     if baseline is not None and baseline not in chosen:
         raise ValueError(f"--baseline must be one of {', '.join(chosen)}, got {baseline!r}.")
-    agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent))
+    with_eqr = {row["agent"] for row in results if learns_latent_model(row)}
+    agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent in with_eqr, agent))
     used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
     used.sort(key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"]))
+    if stopped := sum("stopped_at" in row for _, rows in found.values() for row in rows):
+        notes.append(f"{stopped} runs were stopped before their end and are left out.")
     notes += [*never_learn(used), *settings_differences(used)]
     differing = protocol_differences(used)
     if differing and not force:
@@ -123,24 +144,22 @@ def compare(
         agents=agents,
         scores=pd.DataFrame(),
         results=used,
-        episodes=score_table(results),
         differing=differing,
         notes=notes,
     )
     if comparison.human and not comparison.has_published:
         notes.append("Published scores are omitted, because they are for 100,000 steps.")
-    return dataclasses.replace(comparison, scores=_scores(comparison, references, suites))
+    return dataclasses.replace(comparison, scores=_scores(comparison, references))
 
 
-def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suites: list[Suite]) -> pd.DataFrame:
+def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path]) -> pd.DataFrame:
     """:return: columns agent, game, seed, raw, score; adds a note for each reference with unused runs"""
     final = score_table(comparison.results).query("kind == 'final'")
     tables = [final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()]
-    known = [game for suite in suites for game in suite.games] + load_reference()["game"].unique().tolist()
     for name, path in references.items():
         if name in comparison.agents:
             raise ValueError(f"--reference must have a name that no agent has, got {name!r}. Rename it.")
-        runs = read_runs(path, name, comparison.games, known)
+        runs = read_runs(path, name, comparison.games)
         comparison.notes.extend([runs.attrs["note"]] if "note" in runs.attrs else [])
         tables.append(runs.rename(columns={"score": "raw"}))
     table = pd.concat(tables, ignore_index=True)
@@ -148,24 +167,16 @@ def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path], suit
     return table
 
 
-def _read_suite(folder: pathlib.Path) -> Suite:
-    path = pathlib.Path(folder) / "suite.yml"
-    if not path.is_file():
-        found = "one without suite.yml" if path.parent.is_dir() else "no folder"
-        raise ValueError(f"{folder} must be a folder of sb3-eqr benchmark run, got {found}. Run sb3-eqr benchmark run first.")
-    return read_suite(path)
-
-
-def _load(folders: list[pathlib.Path], agents: list[str]) -> list[dict[str, Any]]:
+def _load(rows: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[str]) -> list[dict[str, Any]]:
     """
+    :param rows: folder -> its finished runs
     :param agents: the agents to keep; empty: all
     :raises ValueError: for a folder or an agent without finished runs, or a run that is in two folders
     """
     results: list[dict[str, Any]] = []
     there: set[str] = set()
     where: dict[tuple, pathlib.Path] = {}
-    for folder in map(pathlib.Path, folders):
-        found = load_results(folder)
+    for folder, found in rows.items():
         if not found:
             raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
         there |= {result["agent"] for result in found}
@@ -209,7 +220,7 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
         if game not in bounds:
             raise ValueError(
                 f"{game} has no bounds for normalisation in {suites[0].name}, which has them for "
-                f"{', '.join(bounds) or 'no game'}.{nearest(game, {plain_game(known): known for known in bounds})} "
+                f"{', '.join(bounds) or 'no game'}. "
                 "Correct the name, or add the game under normalisation: scores in suite.yml."
             )
     return bounds

@@ -1,12 +1,15 @@
-"""Execute all runs of a benchmark, each as a Ray task, and show a table of their progress."""
+"""Execute all runs of a benchmark, each in a process of its own, and show a table of their progress."""
 
 import contextlib
 import datetime
-import logging
+import multiprocessing
 import os
-import socket
+import signal
+import sys
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
+from multiprocessing import connection
 from typing import Any
 
 from rich.console import Console
@@ -20,14 +23,101 @@ from sb3_eqr.common.saving.files import atomic_write
 ATTEMPTS = 2  # a run that crashes is retried once
 REFRESH_SECONDS = 2.0
 BUSY_SECONDS = 5.0  # before retrying a run that another process holds
+LOG = "log.txt"  # in the folder of a run: what its process prints
+SPAWN = multiprocessing.get_context("spawn")  # a forked process would inherit PyTorch's threads
+EXIT_CODES = {"finished": 0, "busy": 75, "stopped": 76}
+
+
+class Crash(Exception):
+    """A run ended without an outcome; the message is the reason."""
+
+
+class Processes:
+    """
+    A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods.
+
+    :param settings: settings of all runs
+    :param slots: number of processes at once
+    """
+
+    def __init__(self, settings: Settings, slots: int):
+        self.slots: float = slots
+        self._settings = settings
+        self._open: dict[Any, Run] = {}
+
+    def start(self, run: Run) -> Any:
+        """
+        Start a process. It inherits its number of threads, which PyTorch reads when it is imported, and that Ctrl-C, which
+        reaches every process of a terminal, is the parent's to handle.
+        """
+        process = SPAWN.Process(target=work, args=(run, self._settings))
+        threads, handler = os.environ.get("OMP_NUM_THREADS"), signal.signal(signal.SIGINT, signal.SIG_IGN)
+        os.environ["OMP_NUM_THREADS"] = str(self._settings.n_threads)
+        try:
+            process.start()
+        finally:
+            signal.signal(signal.SIGINT, handler)
+            del os.environ["OMP_NUM_THREADS"]
+            os.environ |= {} if threads is None else {"OMP_NUM_THREADS": threads}
+        self._open[process] = run
+        return process
+
+    def wait(self, handles: list[Any], timeout: float) -> list[Any]:
+        """:return: processes that have ended"""
+        ended = connection.wait([process.sentinel for process in handles], timeout)
+        return [process for process in handles if process.sentinel in ended]
+
+    def outcome(self, handle: Any) -> str:
+        """
+        :return: what the run's process returned
+        :raises Crash: if a signal killed it, or an exception ended it
+        """
+        handle.join()
+        run = self._open.pop(handle)
+        for outcome, code in EXIT_CODES.items():
+            if handle.exitcode == code:
+                return outcome
+        if handle.exitcode < 0:
+            raise Crash(f"killed by {signal.Signals(-handle.exitcode).name}")
+        raise Crash(last_line(run) or f"exit status {handle.exitcode}")
+
+    def close(self) -> None:
+        """End the processes that still run. Their last checkpoints are complete."""
+        for process in self._open:
+            process.terminate()
+        for process in self._open:
+            process.join()
+
+
+def work(run: Run, settings: Settings) -> None:
+    """Execute a run as the whole life of this process."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    run.folder.mkdir(parents=True, exist_ok=True)
+    log = os.open(run.folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    sys.exit(EXIT_CODES[execute(run, settings)])
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed cannot end its processes."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def last_line(run: Run) -> str:
+    """:return: the last line of what stopped a run, or of what it printed; "" without either"""
+    for path in (run.folder / ERROR, run.folder / LOG):
+        lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
+        if found := [line.strip() for line in lines if line.strip()]:
+            return found[-1]
+    return ""
 
 
 def make_table(runs: list[Run], states: list[State]) -> Table:
-    """
-    :param runs: runs of the benchmark
-    :param states: their states
-    :return: a row per agent, and one for all agents
-    """
+    """:return: a row per agent, and one for all agents"""
     table = Table(box=None, pad_edge=False, caption_justify="left")
     for column in ("agent", "done", "running", "waiting", "failed", "steps", "steps/s"):
         table.add_column(column, justify="left" if column == "agent" else "right")
@@ -45,124 +135,62 @@ def make_table(runs: list[Run], states: list[State]) -> Table:
     return table
 
 
-def run_benchmark(
-    runs: list[Run],
-    settings: Settings,
-    address: str | None = None,
-    cpus_per_run: float = 1.0,
-    gpus_per_run: float = 0.0,
-    console: Console | None = None,
-) -> list[Run]:
+def finish(pool: Any, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
     """
-    Execute all runs: finished runs are skipped, interrupted ones resume from their last checkpoint, runs that another
-    process holds are waited for. A run that crashes twice has failed; the others continue.
+    Execute runs: interrupted ones resume from their last checkpoint, runs that another process holds are waited for. A run
+    that crashes twice has failed; the others continue. When ``settings.stop_at`` has passed, no further run starts.
 
+    :param pool: where to execute them
     :param runs: runs of the benchmark
-    :param settings: settings of all runs
-    :param address: address of a Ray cluster that can access the benchmark's folder; ``None``: this machine
-    :param cpus_per_run: CPUs that Ray reserves for a run
-    :param gpus_per_run: GPUs that Ray reserves for a run, such as 0.1 for ten runs per GPU
-    :param console: where to print the table
-    :return: the runs that failed
-    :raises ImportError: if Ray is not installed
-    :raises ConnectionError: if no cluster answers at the address
-    :raises ValueError: if no machine of the cluster has the resources of a run, which would wait forever
-    """
-    console = console or Console()
-    waiting = [run for run in runs if run.state().name != "done"]
-    if len(waiting) < len(runs):
-        console.print(f"{len(runs) - len(waiting)} of {len(runs)} runs are already finished.")
-    if not waiting:
-        return []
-    console.print("Connecting to Ray ..." if address else "Starting Ray ...")
-    ray = _start_ray(address)
-    try:
-        for name, flag, needed in (("CPU", "--cpus-per-run", cpus_per_run), ("GPU", "--gpus-per-run", gpus_per_run)):
-            there = max((node["Resources"].get(name, 0) for node in ray.nodes() if node["Alive"]), default=0)
-            if needed > there:
-                raise ValueError(f"{flag} must be <= {there:g}, the {name}s of the largest machine, got {needed:g}.")
-        task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=0)(execute)
-        return finish(ray, task, runs, waiting, settings, console)
-    finally:
-        ray.shutdown()
-
-
-def _start_ray(address: str | None) -> Any:
-    """:return: the module ``ray``, connected to the cluster at the address, or to a new one on this machine"""
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError('Ray is not installed. Run pip install ".[benchmark]" in a clone of the repository') from error
-    host, _, port = (address or "").rpartition(":")
-    if host and port.isdigit() and "/" not in host:  # else "auto", or another of Ray's forms
-        try:
-            socket.create_connection((host, int(port)), timeout=5).close()
-        except OSError as error:  # Ray would wait for minutes and then exit the process
-            raise ConnectionError(
-                f"--address: no Ray cluster answers at {address} ({error}). Start one with ray start --head."
-            ) from error
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # as Ray's own warning recommends
-    local: dict[str, Any] = {} if address else {"include_dashboard": False}
-    try:
-        ray.init(address=address or "local", logging_level=logging.ERROR, log_to_driver=False, **local)
-    except ConnectionError as error:
-        raise ConnectionError(f"{error}. If it asks for a token, set RAY_AUTH_MODE=token (docs/benchmark.md).") from error
-    return ray
-
-
-def finish(ray: Any, task: Any, runs: list[Run], waiting: list[Run], settings: Settings, console: Console) -> list[Run]:
-    """
-    :param ray: the module, connected to a cluster
-    :param task: the remote function that executes a run
-    :param runs: runs of the benchmark
-    :param waiting: the runs that are not finished
+    :param waiting: the runs that are not finished, in order
     :param settings: settings of all runs
     :param console: where to print the table
     :return: the runs that failed
     """
     states = [run.state() for run in runs]
-    running = {task.remote(run, settings): run for run in waiting}
+    queue, running, failed = deque(waiting), dict[Any, Run](), []
     busy: list[tuple[float, Run]] = []  # when to retry
     crashes: Counter[str] = Counter()
-    failed = []
     with Live(make_table(runs, states), console=console, auto_refresh=False, transient=True) as live:
-        while running or busy:
-            now = time.monotonic()
-            running |= {task.remote(run, settings): run for when, run in busy if when <= now}
-            busy = [(when, run) for when, run in busy if when > now]
-            if not running:
+        while running or queue or busy:
+            if settings.is_over():
+                queue.clear()
+                busy.clear()
+            queue.extend(run for when, run in busy if when <= time.monotonic())
+            busy = [(when, run) for when, run in busy if run not in queue]
+            while queue and len(running) < pool.slots:
+                run = queue.popleft()
+                running[pool.start(run)] = run
+            if not running and busy:
                 time.sleep(REFRESH_SECONDS)
-            for reference in ray.wait(list(running), timeout=REFRESH_SECONDS)[0] if running else []:
-                run = running.pop(reference)
+            for handle in pool.wait(list(running), REFRESH_SECONDS) if running else []:
+                run = running.pop(handle)
                 try:
-                    is_busy = ray.get(reference) == "busy"
-                except ray.exceptions.RayError as error:
+                    outcome = pool.outcome(handle)
+                except Crash as crash:
                     crashes[run.label] += 1
                     is_lost = crashes[run.label] == ATTEMPTS
-                    _note_crash(run, error, is_lost, console)
+                    _note_crash(run, crash, is_lost, console)
                     if is_lost:
                         failed.append(run)
                     else:
-                        running[task.remote(run, settings)] = run
+                        queue.appendleft(run)
                     continue
-                if is_busy:
+                if outcome == "busy":
                     busy.append((time.monotonic() + BUSY_SECONDS, run))
                 else:
-                    _say(console, f"{run.label}: finished")
+                    _say(console, f"{run.label}: {outcome}")
             states = [state if state.name == "done" else run.state() for run, state in zip(runs, states, strict=True)]
             live.update(make_table(runs, states), refresh=console.is_terminal)
     console.print(make_table(runs, states))
     return failed
 
 
-def _note_crash(run: Run, error: Exception, is_lost: bool, console: Console) -> None:
-    cause = getattr(error, "cause", None) or error
-    reason = " ".join([type(cause).__name__, *str(cause).strip().splitlines()[-1:]])
-    _say(console, f"{run.label}: crashed ({reason}). {f'See {run.folder / ERROR}' if is_lost else 'Retrying once.'}")
+def _note_crash(run: Run, crash: Crash, is_lost: bool, console: Console) -> None:
+    _say(console, f"{run.label}: crashed ({crash}). {f'See {run.folder / ERROR}' if is_lost else 'Retrying once.'}")
     if is_lost and not (run.folder / ERROR).is_file():  # killed before it could write one
         with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
-            file.write(str(error).encode())
+            file.write(str(crash).encode())
 
 
 def _say(console: Console, text: str) -> None:

@@ -1,12 +1,11 @@
 """
-The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 to 7 of the EqR paper, and curves over
+The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 and 5 of the EqR paper, and curves over
 training.
 """
 
 import base64
 import io
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -17,23 +16,17 @@ from matplotlib.figure import Figure
 from rliable import plot_utils
 
 from sb3_eqr.benchmark import statistics
-from sb3_eqr.benchmark.analysis import Analysis, published
+from sb3_eqr.benchmark.analysis import Analysis
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import SHOWN, SHOWN_GROUPS, SHOWN_LOSSES, PublishedMethod
+from sb3_eqr.benchmark.reference import SHOWN
 from sb3_eqr.benchmark.scores import evaluation_curve
 from sb3_eqr.benchmark.tables import aggregate_means
 from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
 
 DPI = 160
 N_THRESHOLDS = 81  # points of a performance profile
-N_LOSSES = 20  # points of a loss curve
 SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's defaults are for slides
 INTERVALS = "95% stratified bootstrap intervals"
-# The agents of Figure 5 (b) and of Figure 6, by their names in a benchmark.
-ABLATIONS = {
-    "loss_components": (r"(eqr_\w+):se2\+aet.*", "Losses", SHOWN_LOSSES, "losses, as in Figure 5 (b) of the EqR paper"),
-    "groups": (r"(eqr_\w+):(mlp|t2|se2|gl2)\+aet\+r", "Groups", SHOWN_GROUPS, "group, as in Figure 6 of the EqR paper"),
-}
 
 
 class ReportFigure(NamedTuple):
@@ -73,15 +66,12 @@ def to_png(shown: ReportFigure) -> bytes:
 def all_figures(analysis: Analysis) -> list[ReportFigure]:
     """:return: the figures for which there is data"""
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
-    best = "Higher is better for IQM, median and mean, lower for the optimality gap; as Figure 5 (a) of the EqR paper."
     with styled():
         return [
             _profiles(analysis, style),
-            _intervals(analysis, style, "aggregates", "Aggregate scores", list(analysis.matrices), SHOWN, best),
-            *_ablations(analysis, style),
-            *_improvements(analysis, style),
+            _aggregates(analysis, style),
             *_sample_efficiency(analysis, style),
-            *_along_training(analysis.comparison, style),
+            *_learning_curves(analysis.comparison, style),
         ]
 
 
@@ -103,47 +93,34 @@ def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
-    taus = thresholds(analysis.matrices)
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
-    kinds = {"runs": statistics.performance_profile, "games": statistics.average_score_profile}
-    for ax, (what, profile) in zip(axes, kinds.items(), strict=True):
-        found = {analysis.comparison.label(a): profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
-        plot_utils.plot_performance_profiles(
-            {agent: value for agent, (value, _, _) in found.items()},
-            taus,
-            {agent: ends for agent, (_, *ends) in found.items()},
-            ax=ax,
-            colors={agent: look.color for agent, look in style.items()},
-            linestyles={agent: look.line for agent, look in style.items()},
-            xlabel=f"score τ ({analysis.comparison.unit})",
-            ylabel=f"fraction of {what} above τ",
-            **SIZES,
-        )
-        for line, look in zip(ax.get_lines(), style.values(), strict=True):
-            line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
-    _legend(figure, style)
-    caption = (
-        "Fraction of runs (left) and of games, by their mean over runs (right), that score above τ, as Figure 4 of the EqR "
-        f"paper. Higher curves are better.{_bands(analysis, 'Bands are pointwise')}"
+    taus, label = thresholds(analysis.matrices), analysis.comparison.label
+    figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    found = {label(a): statistics.performance_profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
+    plot_utils.plot_performance_profiles(
+        {agent: value for agent, (value, _, _) in found.items()},
+        taus,
+        {agent: ends for agent, (_, *ends) in found.items()},
+        ax=ax,
+        colors={agent: look.color for agent, look in style.items()},
+        linestyles={agent: look.line for agent, look in style.items()},
+        xlabel=f"score τ ({analysis.comparison.unit})",
+        ylabel="fraction of runs above τ",
+        **SIZES,
     )
-    return ReportFigure("profiles", "Performance profiles", caption, figure)
+    for line, look in zip(ax.get_lines(), style.values(), strict=True):
+        line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
+    _legend(figure, style)
+    caption = "Fraction of runs that score above τ, as Figure 4 of the EqR paper. Higher curves are better."
+    return ReportFigure("profiles", "Performance profiles", caption + _bands(analysis, "Bands are pointwise"), figure)
 
 
-def _intervals(
-    analysis: Analysis,
-    style: Mapping[str, Look],
-    name: str,
-    title: str,
-    agents: Sequence[str],
-    methods: Sequence[PublishedMethod],
-    explained: str,
-) -> ReportFigure:
-    comparison, metrics = analysis.comparison, list(statistics.METRICS)
+def _aggregates(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
+    comparison, metrics, agents = analysis.comparison, analysis.comparison.metrics, list(analysis.matrices)
     by_agent = analysis.aggregates.set_index(["agent", "metric"])
     points = {comparison.label(a): by_agent.loc[a].loc[metrics, "value"].to_numpy() for a in agents}
     ends = {comparison.label(a): by_agent.loc[a].loc[metrics, ["low", "high"]].to_numpy().T for a in agents}
-    known = aggregate_means(published(comparison, methods), comparison).pivot(index="label", columns="metric", values="value")
-    for method in methods:
+    known = aggregate_means(analysis.means, comparison).pivot(index="label", columns="metric", values="value")
+    for method in SHOWN:
         if method.label in known.index:
             points[f"{method.label}, {method.n_runs}"] = known.loc[method.label, metrics].to_numpy()
             ends[f"{method.label}, {method.n_runs}"] = np.full((2, len(metrics)), np.nan)
@@ -159,54 +136,15 @@ def _intervals(
         ax.set_xlabel(comparison.unit, fontsize="small")
         places = range(len(points))
         ax.plot([values[list(axes).index(ax)] for values in points.values()], places, "o", color=INK, markersize=3)
-    caption = f"{explained} Over all runs and games.{_bands(analysis, 'Bars are')}"
+    gap = "" if analysis.comparison.is_raw else ", lower for the optimality gap"
+    caption = f"Over all runs and games. Higher is better for IQM, median and mean{gap}; as Figure 5 (a) of the EqR paper."
+    caption += _bands(analysis, "Bars are")
     if len(known):
         caption += (
             " Points without a bar are from published game means, over as many runs as named. The IQM and optimality gap of "
             "game means differ slightly from those of runs."
         )
-    return ReportFigure(name, title, caption, figure)
-
-
-def _ablations(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
-    found = []
-    for name, (pattern, title, methods, what) in ABLATIONS.items():
-        by_algorithm: dict[str, list[str]] = {}
-        for agent in analysis.comparison.agents:
-            if match := re.fullmatch(pattern, agent):
-                by_algorithm.setdefault(match[1], []).append(agent)
-        for algorithm, agents in by_algorithm.items():
-            if len(agents) > 1:
-                names = f"{name}_{algorithm}", f"{title} of {algorithm}"
-                found.append(_intervals(analysis, style, *names, agents, methods, f"Agents that differ in their {what}."))
-    return found
-
-
-def _improvements(analysis: Analysis, style: Mapping[str, Look]) -> list[ReportFigure]:
-    rows, label = analysis.improvements.to_dict("records"), analysis.comparison.label
-    if not rows:
-        return []
-    baseline = label(rows[0]["baseline"])
-    figure, ax = plt.subplots(figsize=(5, 0.6 + 0.3 * len(rows)))
-    plot_utils.plot_probability_of_improvement(
-        {f"{label(row['agent'])}|{baseline}": row["value"] for row in rows},
-        {f"{label(row['agent'])}|{baseline}": (row["low"], row["high"]) for row in rows},
-        pair_separator="|",
-        ax=ax,
-        colors=[style[label(row["agent"])].color for row in rows],
-        xlabel=f"P(a run scores higher than one of {baseline})",
-        left_ylabel="",
-        right_ylabel="",
-        **SIZES,
-    )
-    figure.axes[-1].set_yticks([])  # the baseline's name, repeated in every row
-    ax.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
-    ax.set_xlim(-0.02, 1.02)
-    caption = (
-        f"How likely a run of an agent scores higher than one of the baseline, {baseline} (--baseline, or the "
-        f"first stock agent), averaged over games.{_bands(analysis, 'Bars are')}"
-    )
-    return [ReportFigure("improvement", "Probability of improvement", caption, figure)]
+    return ReportFigure("aggregates", "Aggregate scores", caption, figure)
 
 
 def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -273,53 +211,20 @@ def learning_curves(comparison: Comparison) -> pd.DataFrame:
     for run in comparison.results:
         steps, scores = evaluation_curve(run)
         if len(steps) > 1:
-            frames.append(_rows(run, comparison, steps, scores))
+            named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
+            frames.append(pd.DataFrame({"step": steps / 1_000, "value": scores}).assign(**named))
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
-def symmetry_losses(comparison: Comparison) -> pd.DataFrame:
-    """
-    :return: columns game, agent, seed, step, value: L_AET + L_GET of equation 21, or the one of them that the agent has,
-        averaged over twentieths of the training, interpolated where a run logged none, and left out before and after the
-        first and last of all its runs; agents with neither are left out
-    """
-    frames = []
-    for run in comparison.results:
-        rows = [row for row in run.get("losses", []) if "aet_loss" in row or "symmetry_loss" in row]
-        if len(rows) > 1:
-            table = pd.DataFrame(rows).reindex(columns=["step", "aet_loss", "symmetry_loss"]).fillna(0.0)
-            part = run["protocol"]["steps"] / N_LOSSES
-            means = (table["aet_loss"] + table["symmetry_loss"]).groupby(np.ceil(table["step"] / part)).mean()
-            means = means.reindex(range(1, N_LOSSES + 1)).interpolate(limit_area="inside").dropna()
-            frames.append(_rows(run, comparison, means.index.to_numpy() * part, means.to_numpy()))
-    if not frames:
-        return pd.DataFrame()
-    found = pd.concat(frames, ignore_index=True)
-    runs = found.groupby(["game", "agent"])["seed"].transform("nunique")
-    return found[found.groupby(["game", "agent", "step"])["seed"].transform("nunique") == runs]
-
-
-def _rows(run: dict[str, Any], comparison: Comparison, steps: np.ndarray, values: np.ndarray) -> pd.DataFrame:
-    named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
-    return pd.DataFrame({"step": steps / 1_000, "value": values}).assign(**named)
-
-
-def _along_training(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
-    scores, losses = learning_curves(comparison), symmetry_losses(comparison)
-    about_scores = "Raw scores of the evaluations during training."
-    about_losses = "L_AET + L_GET during training, as Figure 7 of the EqR paper; for agents with only one of them, that one."
-    found = []
-    for name, table, ylabel, caption in (
-        ("learning curves", scores, "mean raw score", about_scores),
-        ("symmetry losses", losses, "$L_{AET} + L_{GET}$", about_losses),
-    ):
-        if len(table):
-            band = " Means over runs ± one standard deviation."
-            band = band if table["seed"].nunique() > 1 else " A single run each."
-            shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
-            figure = _small_multiples(table, ylabel, shown)
-            found.append(ReportFigure(name.replace(" ", "_"), name.capitalize(), caption + band, figure))
-    return found
+def _learning_curves(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
+    table = learning_curves(comparison)
+    if not len(table):
+        return []
+    several = table["seed"].nunique() > 1
+    caption = "Raw scores of the evaluations during training. "
+    caption += "Means over runs ± one standard deviation." if several else "A single run each."
+    shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
+    return [ReportFigure("learning_curves", "Learning curves", caption, _small_multiples(table, "mean raw score", shown))]
 
 
 def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]) -> Figure:

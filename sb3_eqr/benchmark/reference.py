@@ -1,6 +1,5 @@
 """Published scores on Atari 100K, with their sources."""
 
-import difflib
 import pathlib
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -37,13 +36,6 @@ SHOWN = (
     PublishedMethod("SPR+resets (Nikishin et al., 32 runs, final eval, back-computed from HNS)", "SPR with resets", 32),
     PublishedMethod("BBF RR8_BBF", "BBF, replay ratio 8", 52, 60),
 )
-SHOWN_LOSSES = SHOWN[:4]  # Table 4
-SHOWN_GROUPS = (  # Table 3
-    PublishedMethod("MLP [EqR Tab3]", "MLP (paper)", 10),
-    PublishedMethod("EqR, T_2 [EqR Tab3]", "EqR, T(2) (paper)", 10),
-    PublishedMethod("EqR, SE_2 [EqR Tab3]", "EqR, SE(2) (paper)", 10),
-    PublishedMethod("EqR, GL_2 [EqR Tab3]", "EqR, GL(2) (paper)", 10),
-)
 
 
 def load_reference() -> pd.DataFrame:
@@ -62,35 +54,6 @@ def plain_game(name: str) -> str:
     :return: its spelling in the bundled scores: "bankheist"
     """
     return name.replace("_", "").replace(" ", "").lower()
-
-
-def match_games(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """
-    :param names: names of games in any spelling
-    :param known: the names to match them to, ignoring case, "_" and spaces
-    :return: name -> known name
-    :raises ValueError: for a name without a match, with the nearest one, and for two names with the same match
-    """
-    by_plain = {plain_game(game): game for game in known}
-    found: dict[str, str] = {}
-    for name in names:
-        plain = plain_game(name)
-        if plain not in by_plain:
-            raise ValueError(f"game must be one of {', '.join(by_plain.values())}, got {name!r}.{nearest(name, by_plain)}")
-        if by_plain[plain] in found.values():
-            raise ValueError(f"Each game must be given once, got {name!r} in two spellings. Keep one of them.")
-        found[name] = by_plain[plain]
-    return found
-
-
-def nearest(name: str, by_plain: dict[str, str]) -> str:
-    """
-    :param name: an unknown name
-    :param by_plain: plain name -> name, for all known names
-    :return: a sentence with the most similar name, "" if none is similar
-    """
-    close = difflib.get_close_matches(plain_game(name), list(by_plain), n=1)
-    return f" Did you mean {by_plain[close[0]]!r}?" if close else ""
 
 
 def published_means(methods: Iterable[PublishedMethod], games: Iterable[str]) -> pd.DataFrame:

@@ -1,7 +1,6 @@
 """The report of a benchmark: a page, figures, tables and data files from folders of runs."""
 
 import importlib.metadata
-import io
 import json
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -9,7 +8,6 @@ from typing import Any
 
 import jinja2
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from sb3_eqr.benchmark.analysis import Analysis, aggregates_file, all_of, analyse, conclusion, counted, notes, table_notes
@@ -17,7 +15,15 @@ from sb3_eqr.benchmark.comparison import Comparison, compare
 from sb3_eqr.benchmark.figures import all_figures, to_png
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.statistics import REPS
-from sb3_eqr.benchmark.tables import Table, game_table, make_table, number, summary_table, to_html, to_latex, to_markdown
+from sb3_eqr.benchmark.tables import (
+    Table,
+    difference_table,
+    game_table,
+    make_table,
+    number,
+    to_html,
+    to_markdown,
+)
 from sb3_eqr.common.saving.files import atomic_write
 
 TEMPLATE = pathlib.Path(__file__).with_name("report.html.jinja")
@@ -34,9 +40,9 @@ def write_report(
     reps: int = REPS,
 ) -> pathlib.Path:
     """
-    Write report.html, its figures as PNG, table.md, table.tex, scores.csv, scores.parquet and aggregates.csv.
+    Write report.html, its figures as PNG, table.md and aggregates.csv.
 
-    :param folders: folders of benchmarks, with suite.yml and runs/
+    :param folders: folders of benchmarks, with suite.yml and runs/, or files of ``sb3-eqr benchmark pack``
     :param references: name -> JSON file with the runs of another method, game -> raw scores
     :param force: also compare agents with different protocols, which are marked, or with missing games
     :param output: output folder, created if needed
@@ -52,10 +58,9 @@ def write_report(
     figures = all_figures(analysis)
     table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
     files = {f"{figure.name}.png": to_png(figure) for figure in figures}
-    files |= _data_files(comparison.episodes, aggregates_file(analysis)) | _table_files(analysis, table)
+    files["table.md"] = _markdown(analysis, table)
+    files["aggregates.csv"] = aggregates_file(analysis).to_csv(index=False).encode()
     before, shown = notes(analysis), conclusion(analysis)
-    if "scores.parquet" not in files:
-        before.append("scores.parquet was left out: it needs pyarrow (pip install pyarrow).")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
@@ -65,10 +70,11 @@ def write_report(
         lead=_lead(comparison),
         conclusion=shown,
         notes=before,
-        summary=_html(summary_table(comparison, analysis.aggregates, analysis.matrices, reps)),
         figures=[(figure, files[f"{figure.name}.png"]) for figure in figures],
         human=comparison.human,
+        raw=comparison.is_raw,
         games=_html(table),
+        differences=_html(difference_table(comparison)) if len(analysis.matrices) > 1 else "",
         about_games=table_notes(analysis),
         settings=_settings(comparison),
         commands=_commands(comparison, command),
@@ -97,26 +103,16 @@ def _lead(comparison: Comparison) -> str:
     when = f"on {days[0]}" if days[0] == days[-1] else f"from {days[0]} to {days[-1]}"
     return (
         f"{counted(len(comparison.agents), 'agent')} on {counted(len(comparison.games), 'game')}, "
-        f"{per_game} of each per game, started {when}. Normalised scores: {comparison.unit} ({comparison.source}). "
+        f"{per_game} of each per game, started {when}. "
+        f"{'Scores are raw' if comparison.is_raw else f'Normalised scores: {comparison.unit} ({comparison.source})'}. "
         "IQM: the mean of their middle half."
     )
 
 
-def _data_files(episodes: pd.DataFrame, aggregates: pd.DataFrame) -> dict[str, bytes]:
-    """:return: name -> content; without scores.parquet if pandas has no library to write it"""
-    files = {"scores.csv": episodes.to_csv(index=False).encode(), "aggregates.csv": aggregates.to_csv(index=False).encode()}
-    buffer = io.BytesIO()
-    try:
-        episodes.to_parquet(buffer, index=False)
-    except ImportError:
-        return files
-    return files | {"scores.parquet": buffer.getvalue()}
-
-
-def _table_files(analysis: Analysis, table: Table) -> dict[str, bytes]:
+def _markdown(analysis: Analysis, table: Table) -> bytes:
     about = [*conclusion(analysis), *notes(analysis), *table_notes(analysis)]
-    markdown = "\n".join([to_markdown(table), *(f"- {note}" for note in about), ""])
-    return {"table.md": markdown.encode(), "table.tex": ("".join(f"% {note}\n" for note in about) + to_latex(table)).encode()}
+    compared = to_markdown(difference_table(analysis.comparison)) if len(analysis.matrices) > 1 else ""
+    return "\n".join([to_markdown(table), *(f"- {note}" for note in about), "", compared]).encode()
 
 
 def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
@@ -137,7 +133,6 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
 
 def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
     """
-    :param path: keys of the settings in a result
     :return: a row per setting, a column per agent; where runs of an agent differ, all values separated by "/"
     """
 

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import pathlib
+import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
@@ -10,13 +12,14 @@ from filelock import FileLock, Timeout
 from sb3_eqr.benchmark.agents import Agent, defaults, find_agent, hyperparameters
 from sb3_eqr.benchmark.evaluation import check_game
 from sb3_eqr.benchmark.selection import flatten
-from sb3_eqr.benchmark.suites import Strict, Suite, read_suite, write_suite
+from sb3_eqr.benchmark.suites import Strict, Suite, merge, read_suite, write_suite
 from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.zoo import register
 
 SUITE = "suite.yml"  # in the folder of the benchmark
 RESULT, PLAN, PROGRESS, ERROR, LOCK = "result.json", "run.json", "progress.json", "error.txt", "lock"  # in that of a run
+STOPPED = "stopped.json"  # the row of a run that was stopped before its end; its checkpoint is next to it
 MODELS = "models"  # RL Zoo's log folder of a run
 STARTS = "starts.txt"  # a line for each time that a run starts or resumes
 
@@ -30,6 +33,7 @@ class Settings(Strict):
     :param checkpoint_seconds: seconds between checkpoints
     :param gym_packages: packages that register environments
     :param save_models: whether to save trained agents in the format of RL Zoo
+    :param stop_at: when to stop, in seconds since the epoch; ``None``: never
     """
 
     device: str = "auto"
@@ -37,6 +41,11 @@ class Settings(Strict):
     checkpoint_seconds: float = 300.0
     gym_packages: list[str] = []
     save_models: bool = False
+    stop_at: float | None = None
+
+    def is_over(self) -> bool:
+        """:return: whether the time to stop has passed"""
+        return self.stop_at is not None and time.time() >= self.stop_at
 
 
 class State(NamedTuple):
@@ -136,20 +145,13 @@ def write_json(path: pathlib.Path, value: Any) -> None:
         file.write(to_json(value).encode())
 
 
-def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: int, command: str = "") -> list[Run]:
+def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], seeds: Sequence[int], command: str = "") -> list[Run]:
     """
     Plan the runs of a benchmark, without writing anything. The seed is the outermost loop, so that an interrupted benchmark
     has complete tables of fewer seeds.
 
-    :param folder: folder of the benchmark
-    :param suite: the suite
-    :param agents: agents as given by the user
-    :param n_seeds: number of seeds, counted from 0
-    :param command: the command of the user
     :raises ValueError: for two agents of the same name, or for runs that exist with other settings
     """
-    if n_seeds < 1:
-        raise ValueError(f"--seeds must be >= 1, got {n_seeds}.")
     found = [find_agent(text) for text in agents]
     names = [agent.name for agent in found]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -160,18 +162,17 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], n_seeds: in
         action_space = check_game(protocol)
         for agent in found:
             entry = hyperparameters(agent, protocol, action_space)
-            for seed in range(n_seeds):
+            for seed in seeds:
                 place = folder / "runs" / agent.name.replace(":", "-") / game.replace("/", "-") / str(seed)
                 unnamed = defaults(agent, entry)
                 runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command, unnamed))
     for run in runs:
         _check_plan(run)
-    return sorted(runs, key=lambda run: run.seed)
+    return sorted(runs, key=lambda run: seeds.index(run.seed))
 
 
 def with_present_defaults(runs: list[Run]) -> list[Run]:
     """
-    :param runs: runs of a folder
     :return: the same, where those without a result have the defaults of this version of the package
     :raises ValueError: if a run that has begun was started with others
     """
@@ -213,25 +214,11 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / f".{SUITE}.lock"):  # two commands may add games at once
-        _write_suite(folder / SUITE, suite)
+        path = folder / SUITE
+        write_suite(merge(read_suite(path), suite) if path.is_file() else suite, path)
     for run in runs:
         if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
             write_json(run.folder / PLAN, run.description())
-
-
-def _write_suite(path: pathlib.Path, suite: Suite) -> None:
-    if path.is_file():
-        old = read_suite(path)
-        if old.name != suite.name:
-            raise ValueError(
-                f"{path.parent} must hold a benchmark of suite {suite.name!r}, got {old.name!r}. Use another folder."
-            )
-        games = [*old.games, *(game for game in suite.games if game not in old.games)]
-        scores = old.normalisation.scores | suite.normalisation.scores
-        normalisation = suite.normalisation.model_copy(update={"scores": scores})
-        update = {"games": games, "steps": old.steps | suite.steps, "normalisation": normalisation}
-        suite = suite.model_copy(update=update)
-    write_suite(suite, path)
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:

@@ -1,6 +1,5 @@
 """Scores as data: those of a benchmark's runs, and those of other methods' runs from a file."""
 
-import json
 import pathlib
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -10,22 +9,17 @@ import pandas as pd
 from annotated_types import Len
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
-from sb3_eqr.benchmark.reference import match_games, plain_game
-from sb3_eqr.benchmark.runs import RESULT
+from sb3_eqr.benchmark.packed import read
+from sb3_eqr.benchmark.reference import plain_game
 
 # game -> scores of runs
 RUNS = TypeAdapter(Annotated[dict[str, Annotated[list[FiniteFloat], Len(1)]], Len(1)], config={"strict": True})
 COLUMNS = ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
 
 
-def load_results(folder: pathlib.Path) -> list[dict[str, Any]]:
-    """:return: ``result.json`` of every finished run of a benchmark"""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob(f"runs/*/*/*/{RESULT}"))]
-
-
 def score_table(results: list[dict[str, Any]]) -> pd.DataFrame:
     """
-    :param results: see :func:`load_results`
+    :param results: rows of finished runs, see :func:`~sb3_eqr.benchmark.packed.read`
     :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
         (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
     """
@@ -43,21 +37,18 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
     """
     Load every episode of every finished run of a benchmark.
 
-    :param folder: folder of the benchmark
+    :param folder: folder of the benchmark, or a file of ``sb3-eqr benchmark pack``
     :return: see :func:`score_table`
     :raises ValueError: for a folder without finished runs
     """
-    results = load_results(pathlib.Path(folder))
+    results = [row for row in read(pathlib.Path(folder))[1] if "stopped_at" not in row]
     if not results:
         raise ValueError(f"{folder} must be the folder of a benchmark, got one without finished runs.")
     return score_table(results)
 
 
 def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """
-    :param result: result of a run
-    :return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one
-    """
+    """:return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one"""
     found: dict[int, float] = {}
     for evaluation in sorted(result["evaluations"], key=lambda row: row["kind"] == "final"):  # the final one overrides
         if evaluation["scores"]:
@@ -66,19 +57,16 @@ def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array([found[step] for step in steps])
 
 
-def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Iterable[str] = ()) -> pd.DataFrame:
+def read_runs(path: pathlib.Path, name: str, games: Iterable[str]) -> pd.DataFrame:
     """
     Read scores of another method's runs, in rliable's format: {"Alien": [812.0, 640.5, ...], ...}.
 
-    :param path: a JSON file: game -> raw scores, one per run
+    :param path: a JSON file: game, in any spelling -> raw scores, one per run; other games are left out
     :param name: name of the method
-    :param games: required games
-    :param others: other games that the file may contain and that are left out
     :return: columns agent, game, seed, score; for every game the first runs, as many as the game with the fewest has; if
         that leaves some out, ``attrs["note"]`` says so
-    :raises ValueError: for a file that is not JSON or has another form, and for missing and unknown games
+    :raises ValueError: for a file that is not JSON or has another form, and for missing games
     """
-    games = list(games)
     expected = f'--reference {name}: {path} must contain {{"Game": [score, score, ...], ...}} with a raw score per run'
     try:
         content = RUNS.validate_json(pathlib.Path(path).read_bytes())
@@ -88,23 +76,16 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str], others: Itera
         mistake = error.errors()[0]
         where = "".join(f"{place}: " for place in mistake["loc"])
         raise ValueError(f"{expected}, got {where}{mistake['msg']}. Write its runs as lists of finite numbers.") from error
-    try:
-        matched = match_games(content, {plain_game(game): game for game in [*others, *games]}.values())
-    except ValueError as error:
-        raise ValueError(f"--reference {name}: {path}: {error} Correct the name or remove the game.") from error
-    missing = [game for game in games if game not in matched.values()]
-    unused = [given for given, game in matched.items() if game not in games]
-    if missing:
+    by_plain, games = {plain_game(game): scores for game, scores in content.items()}, list(games)
+    if missing := [game for game in games if plain_game(game) not in by_plain]:
         raise ValueError(
-            f"--reference {name}: {path} must contain scores for {', '.join(games)}, got none for {', '.join(missing)}"
-            f"{f' (not needed: {chr(44).join(unused)})' if unused else ''}. "
-            "Add them or report without this reference."
+            f"--reference {name}: {path} must contain scores for {', '.join(games)}, got none for {', '.join(missing)}, "
+            f"only for {', '.join(content)}. Add them, correct their names, or report without this reference."
         )
-    wanted = {game: content[given] for given, game in matched.items() if game in games}
+    wanted = {game: by_plain[plain_game(game)] for game in games}
     runs = min(map(len, wanted.values()))
     rows = [(name, game, seed, float(score)) for game in games for seed, score in enumerate(wanted[game][:runs])]
     table = pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
-    if most := max(map(len, wanted.values())) - runs:
-        fewest = next(game for game, scores in wanted.items() if len(scores) == runs)
-        table.attrs["note"] = f"{name}: first {runs} runs only, as many as {fewest} has; other games have up to {most} more."
+    if max(map(len, wanted.values())) > runs:
+        table.attrs["note"] = f"{name}: the first {runs} runs of every game only, as many as all of them have."
     return table

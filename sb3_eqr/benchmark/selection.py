@@ -10,7 +10,6 @@ def protocol_differences(results: list[dict[str, Any]]) -> dict[str, str]:
     """
     Find runs whose steps, preprocessing or evaluation differ from those of most runs of the same game.
 
-    :param results: results of runs
     :return: agent -> what differs, with the games
     """
     found: dict[str, dict[str, list[str]]] = {}
@@ -36,10 +35,7 @@ def _show(values: Mapping[str, Any], key: str) -> str:
 
 
 def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
-    """
-    :param values: nested dictionaries and lists
-    :return: "outer.inner" -> value; empty dictionaries are values
-    """
+    """:return: "outer.inner" -> value; empty dictionaries are values"""
     if isinstance(values, dict) and values:
         pairs = [flatten(value, f"{prefix}.{key}" if prefix else str(key)) for key, value in values.items()]
         return {key: value for pair in pairs for key, value in pair.items()}
@@ -48,7 +44,6 @@ def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
 
 def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     """
-    :param results: results of runs
     :return: a sentence for every agent whose runs of a game differ in hyperparameters, or in defaults where both have them
     """
     found: dict[str, dict[str, None]] = {}
@@ -61,6 +56,12 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
         for key in keys:
             found.setdefault(result["agent"], {})[key] = None
     return [f"{agent}: its runs differ in {', '.join(sorted(keys))}." for agent, keys in found.items()]
+
+
+def learns_latent_model(result: dict[str, Any]) -> bool:
+    """:return: whether the run's agent is one of EqR with a latent model, rather than stock or without EqR"""
+    settings = {**result.get("defaults", {}), **result["entry"]["hyperparameters"]}
+    return result["entry"]["algo"].startswith("eqr_") and settings.get("prediction_depth") != 0
 
 
 ON_POLICY = ("a2c", "ppo", "ppo_lstm", "trpo")  # RL Zoo's agents that learn after a whole rollout

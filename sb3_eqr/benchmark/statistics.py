@@ -13,6 +13,7 @@ from scipy.stats import t as student
 from scipy.stats import trim_mean
 
 CONFIDENCE = 0.95
+MIN_RUNS = 3  # for a verdict: two runs hardly show how much scores differ by chance
 REPS = 2_000  # bootstrap samples, stratified by game, as for rliable's profiles
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]  # value, low, high
 
@@ -100,7 +101,7 @@ def aggregate(matrices: Mapping[str, np.ndarray], reps: int = REPS, seed: int = 
 
 def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """
-    The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 (a) of EqR).
+    The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 of EqR).
 
     :param matrix: (runs, games), normalised scores
     :param thresholds: (n,), in the unit of the scores
@@ -113,50 +114,12 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
     return estimate(fractions, matrix, reps=reps, seed=seed)
 
 
-def average_score_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
-    """As :func:`performance_profile`, for the fraction of games whose mean over runs is above a threshold (Fig. 4 (b))."""
-    return estimate(lambda scores: (scores.mean(axis=-2)[..., None] > thresholds).mean(axis=-2), matrix, reps=reps, seed=seed)
-
-
 def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
     """
     :param curves: (runs, games, points), normalised scores of the evaluations during training
     :return: IQM, low, high: (points,) each
     """
     return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps=reps, seed=seed)
-
-
-def probability_of_improvement(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """
-    How likely a run of the first agent beats one of the second, averaged over games; ties count as one half.
-
-    :param first: (..., runs, games)
-    :param second: (..., runs, games), where the number of runs may differ from the first's
-    :return: (...), in [0, 1]
-    """
-    wins = [
-        (run > second).mean(axis=(-2, -1)) + 0.5 * (run == second).mean(axis=(-2, -1))
-        for run in np.moveaxis(first[..., None, :], -3, 0)
-    ]
-    return np.mean(wins, axis=0)
-
-
-def improvement_probabilities(
-    matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS, seed: int = 0
-) -> pd.DataFrame:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :param baseline: the agent that the others are compared with
-    :return: columns agent, baseline, value, low, high; a row per agent other than the baseline
-    """
-    rows = [
-        (agent, baseline, *estimate(probability_of_improvement, matrix, matrices[baseline], reps=reps, seed=seed))
-        for agent, matrix in matrices.items()
-        if agent != baseline
-    ]
-    return pd.DataFrame(rows, columns=["agent", "baseline", "value", "low", "high"]).astype(
-        {"value": float, "low": float, "high": float}
-    )
 
 
 def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS, seed: int = 0) -> float:
@@ -183,7 +146,7 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
     :param matrices: agent -> (runs, games), normalised scores
     :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, runs, baseline_runs, games, difference (of the IQMs, agent - baseline), detectable
-        (see :func:`detectable_difference`)
+        (see :func:`detectable_difference`; NaN for fewer than ``MIN_RUNS`` runs)
     """
     other = matrices[baseline]
     return pd.DataFrame(
@@ -194,7 +157,9 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
             "baseline_runs": len(other),
             "games": matrix.shape[1],
             "difference": iqm(matrix) - iqm(other),
-            "detectable": detectable_difference(matrix, other, reps, seed),
+            "detectable": detectable_difference(matrix, other, reps, seed)
+            if min(len(matrix), len(other)) >= MIN_RUNS
+            else np.nan,
         }
         for agent, matrix in matrices.items()
         if agent != baseline

@@ -14,6 +14,7 @@ from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.zoo.checks import SIMILAR, nearest
 
+RAW = "raw score"  # the unit of scores that are not normalised
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
 
 
@@ -61,7 +62,8 @@ class Suite(Strict):
     """
     :param name: name of the suite
     :param games: names of the games, as given by the user
-    :param env_id: gymnasium's name of a game's environment, with "{game}" in place of the game
+    :param env_id: gymnasium's name of a game's environment, with "{game}" in place of the game, or game -> name
+    :param env_kwargs: game -> arguments of its environment
     :param steps: training steps of the agent, per game; in a file also one number for all games
     :param preprocessing: keys of RL Zoo's entries (``env_wrapper``, ``frame_stack``, ...) that override an agent's own
     :param evaluation: the evaluation; its preprocessing defaults to that of training
@@ -70,7 +72,8 @@ class Suite(Strict):
 
     name: str
     games: Annotated[list[str], Len(1)]
-    env_id: str
+    env_id: str | dict[str, str]
+    env_kwargs: dict[str, dict[str, Any]] = {}
     steps: dict[str, PositiveInt]
     preprocessing: dict[str, Any] = {}
     evaluation: Evaluation
@@ -83,7 +86,7 @@ class Suite(Strict):
         if not isinstance(entry, dict) or not isinstance(entry.get("games"), list):
             return entry  # pydantic reports what is wrong
         games = [game for game in entry["games"] if isinstance(game, str)]
-        found = {"normalisation": {"unit": "raw score", "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
+        found = {"normalisation": {"unit": RAW, "source": "none", "scores": {game: [0, 1] for game in games}}} | entry
         if found["normalisation"] == "human":
             found["normalisation"] = human_scores(games)
         if "steps" in found and not isinstance(found["steps"], dict):
@@ -94,23 +97,28 @@ class Suite(Strict):
 
     @model_validator(mode="after")
     def _covers_games(self) -> "Suite":
-        if "{game}" not in self.env_id and len(self.games) > 1:
+        if isinstance(self.env_id, str) and "{game}" not in self.env_id and len(self.games) > 1:
             raise ValueError(f"env_id must contain {{game}}, got {self.env_id!r}.")
         folders = [game.replace("/", "-") for game in self.games]
         if unfit := [game for game, name in zip(self.games, folders, strict=True) if folders.count(name) > 1 or "\\" in name]:
             raise ValueError(f"games must have names that differ as names of folders, got {', '.join(unfit)}.")
-        for what, there in (("steps", self.steps), ("normalisation: scores", self.normalisation.scores)):
+        needed: dict[str, Any] = {"steps": self.steps, "normalisation: scores": self.normalisation.scores}
+        for what, there in (needed if isinstance(self.env_id, str) else {"env_id": self.env_id, **needed}).items():
             if missing := [game for game in self.games if game not in there]:
                 raise ValueError(f"{what} must have every game, got none for {', '.join(missing)}.")
         return self
 
     def protocol(self, game: str) -> dict[str, Any]:
         """:return: the settings that two scores must share to be comparable"""
+        evaluation, own = (
+            self.evaluation.model_dump(),
+            {"env_kwargs": self.env_kwargs[game]} if game in self.env_kwargs else {},
+        )
         return {
-            "env_id": self.env_id.format(game=game),
+            "env_id": self.env_id.format(game=game) if isinstance(self.env_id, str) else self.env_id[game],
             "steps": self.steps[game],
-            "preprocessing": self.preprocessing,
-            "evaluation": self.evaluation.model_dump(),
+            "preprocessing": {**self.preprocessing, **own},
+            "evaluation": {**evaluation, "preprocessing": {**evaluation["preprocessing"], **own}},
         }
 
 
@@ -146,7 +154,8 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
 
 def _first_mistake(error: ValidationError) -> str:
     """:return: the first mistake in words: the key, what it must be, and its value"""
-    mistake = error.errors(include_url=False)[0]
+    mistakes = error.errors(include_url=False)  # a misspelt key is also missing: its name says more
+    mistake = next((one for one in mistakes if one["type"] == "extra_forbidden"), mistakes[0])
     *outer, key = mistake["loc"] or ("",)
     path = ": ".join(map(str, mistake["loc"]))
     if mistake["type"] == "extra_forbidden":
@@ -185,11 +194,12 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     return make_suite(name, path.name, entry)
 
 
-def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
+def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: int | None = None) -> Suite:
     """
     :param suite: the suite
     :param games: the games to keep, ignoring case; ``None``: all
     :param steps: training steps that override the suite's
+    :param episodes: episodes of the final evaluation that override the suite's
     :raises ValueError: for a game that the suite or gymnasium does not have, with the nearest name
     """
     envs.register()
@@ -201,14 +211,30 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None) -> Suite:
         kept = [game for game in suite.games if game.lower() in map(str.lower, games)]
     per_game = suite.steps if steps is None else dict.fromkeys(kept, steps)
     for game in kept:
-        env_id = suite.env_id.format(game=game)
+        env_id = suite.protocol(game)["env_id"]
         if env_id not in gym.registry:
             raise ValueError(
                 f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
                 f"{nearest(env_id, gym.registry, SIMILAR)} Environments of another package need --gym-packages PACKAGE, Atari "
                 'pip install ".[atari]" in a clone of the repository.'
             )
-    return suite.model_copy(update={"games": kept, "steps": per_game})
+    evaluation = suite.evaluation if episodes is None else suite.evaluation.model_copy(update={"episodes": episodes})
+    return suite.model_copy(update={"games": kept, "steps": per_game, "evaluation": evaluation})
+
+
+def merge(old: Suite, new: Suite) -> Suite:
+    """
+    :return: the new suite, with the games of the old one before its own
+    :raises ValueError: if they are not the same suite
+    """
+    if old.name != new.name:
+        raise ValueError(
+            f"The runs must be of suite {old.name!r}, as those that are there, got {new.name!r}. Use another place."
+        )
+    scores = old.normalisation.scores | new.normalisation.scores
+    update: dict[str, Any] = {"normalisation": new.normalisation.model_copy(update={"scores": scores})}
+    update |= {"games": [*dict.fromkeys([*old.games, *new.games])], "steps": old.steps | new.steps}
+    return new.model_copy(update=update)
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:

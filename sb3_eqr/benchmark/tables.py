@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ttest_ind
 
 from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM
-from sb3_eqr.benchmark.statistics import METRICS, detectable_difference, games_above, iqm
-
-LATEX = {"±": r"$\pm$", "−": "$-$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}"}  # pandas does not escape these
+from sb3_eqr.benchmark.statistics import METRICS, MIN_RUNS, detectable_difference, games_above, iqm
 
 
 class Table(NamedTuple):
@@ -56,17 +55,6 @@ def to_markdown(table: Table) -> str:
     return cells.to_markdown(index=False, disable_numparse=True, colalign=align) + "\n"
 
 
-def to_latex(table: Table) -> str:
-    """:return: a ``tabular`` with rules of the package booktabs"""
-    cells = table.cells.replace(r"\n", " ", regex=True)
-    style = cells.style.format(escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
-    style = style.apply(lambda _: table.bold.replace({True: "font-weight: bold", False: ""}), axis=None)
-    text = style.to_latex(hrules=True, convert_css=True, column_format="l" + "r" * (len(cells.columns) - 1))
-    for sign, command in LATEX.items():
-        text = text.replace(sign, command)
-    return "% Needs \\usepackage{booktabs}.\n" + text
-
-
 def number(value: float, decimals: int | None = None) -> str:
     """
     :param value: a score
@@ -97,10 +85,14 @@ def distinct_best(matrices: Mapping[str, np.ndarray], differing: Mapping[str, st
     """
     values = {agent: float(iqm(matrix)) for agent, matrix in matrices.items() if agent not in differing}
     best = max(values, key=lambda agent: values[agent], default="")
-    is_distinct = len(values) > 1 and all(
-        values[best] - value > detectable_difference(matrices[best], matrices[agent], reps)  # NaN: no
-        for agent, value in values.items()
-        if agent != best
+    is_distinct = (
+        len(values) > 1
+        and min(len(matrices[agent]) for agent in values) >= MIN_RUNS
+        and all(
+            values[best] - value > detectable_difference(matrices[best], matrices[agent], reps)
+            for agent, value in values.items()
+            if agent != best
+        )
     )
     return [is_distinct and agent == best for agent in matrices]
 
@@ -120,42 +112,17 @@ def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame
     return pd.DataFrame(rows, columns=["label", "metric", "value"])
 
 
-def aggregate_rows(
-    comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray]
-) -> dict[str, list[str]]:
-    """
-    :param aggregates: columns agent, metric, value, low, high
-    :param matrices: agent -> (runs, games), normalised scores
-    :return: name of the row -> a string per agent
-    """
-    by_agent = aggregates.set_index(["agent", "metric"])
-    rows = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in METRICS}
-    rows[comparison.above_one] = [str(games_above(matrix)) for matrix in matrices.values()]
-    rows["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
-    return rows
-
-
-def summary_table(comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], reps: int) -> Table:
-    """The aggregates of the runs compared, a row per agent; for the parameters see :func:`aggregate_rows`."""
-    columns = aggregate_rows(comparison, aggregates, matrices)
-    rows = [
-        [comparison.label(agent), str(len(matrix)), *(texts[place] for texts in columns.values())]
-        for place, (agent, matrix) in enumerate(matrices.items())
-    ]
-    best = distinct_best(matrices, comparison.differing, reps)
-    bold = [[column == 2 and is_best for column in range(len(rows[0]))] for is_best in best]
-    return make_table(["agent", "runs", *columns], rows, bold)
-
-
 def game_table(
     comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], means: pd.DataFrame, reps: int
 ) -> Table:
     """
     A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below.
 
-    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`; for the other parameters see :func:`aggregate_rows`
+    :param aggregates: columns agent, metric, value, low, high
+    :param matrices: agent -> (runs, games), normalised scores
+    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`
     """
-    names = (RANDOM, HUMAN) if comparison.human else ("score 0", "score 1")
+    names = (RANDOM, HUMAN) if comparison.human else () if comparison.is_raw else ("score 0", "score 1")
     header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
     by_game = comparison.scores.groupby(["agent", "game"])["raw"].agg(["mean", "std"])
     rows, bold = [], []
@@ -165,16 +132,42 @@ def game_table(
         texts = [
             number(mean) + ("" if np.isnan(spread) else f"\n± {number(spread, decimals_of(mean))}") for mean, spread in found
         ]
-        bounds = [number(bound) for bound in comparison.bounds[game]]
+        bounds = [number(bound) for bound in comparison.bounds[game] if names]
         rows.append([game, *bounds, *texts, *(number(means.at[game, method]) for method in means)])
         of_game = {agent: matrix[:, [place]] for agent, matrix in matrices.items()}
-        bold.append([False] * 3 + distinct_best(of_game, comparison.differing, reps) + [False] * len(means.columns))
+        is_best = distinct_best(of_game, comparison.differing, reps)
+        bold.append([False] * (1 + len(names)) + is_best + [False] * len(means.columns))
     of_means = aggregate_means(means, comparison).set_index(["label", "metric"])["value"]
-    for name, texts in aggregate_rows(comparison, aggregates, matrices).items():
+    by_agent = aggregates.set_index(["agent", "metric"])
+    last = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in comparison.metrics}
+    last |= {} if comparison.is_raw else {comparison.above_one: [str(games_above(matrix)) for matrix in matrices.values()]}
+    last["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
+    for name, texts in last.items():
         ends = ("1", "0") if name == "optimality gap" else ("0", "1") if name in METRICS else ("", "")
         metric = "above 1" if name == comparison.above_one else name
         known = [of_means.get((method, metric), np.nan) for method in means]
-        rows.append([name, *ends, *texts, *(number(value, 3 if name in METRICS else 0) for value in known)])
+        rows.append([name, *ends[: len(names)], *texts, *(number(value, 3 if name in METRICS else 0) for value in known)])
         is_best = distinct_best(matrices, comparison.differing, reps) if name == "IQM" else [False] * len(matrices)
-        bold.append([False] * 3 + is_best + [False] * len(means.columns))
+        bold.append([False] * (1 + len(names)) + is_best + [False] * len(means.columns))
     return make_table(header, rows, bold)
+
+
+def difference_table(comparison: Comparison) -> Table:
+    """
+    A row per game, a column per agent: the difference of its mean raw score from that of the first agent, and its 95%
+    interval (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28), where both have several runs with different scores.
+    """
+    raw = {key: rows["raw"].to_numpy() for key, rows in comparison.scores.groupby(["agent", "game"])}
+    first, *others = dict.fromkeys(comparison.scores["agent"])
+    rows = []
+    for game in comparison.games:
+        cells = []
+        for agent in others:
+            pair = raw[agent, game], raw[first, game]
+            text = number(pair[0].mean() - pair[1].mean())
+            if min(map(len, pair)) > 1 and max(map(np.ptp, pair)) > 0:
+                ends = ttest_ind(*pair, equal_var=False).confidence_interval()
+                text += f"\n[{number(ends.low)}, {number(ends.high)}]"
+            cells.append(text)
+        rows.append([game, *cells])
+    return make_table([f"minus {comparison.label(first)}", *(f"{comparison.label(agent)}" for agent in others)], rows)

@@ -24,19 +24,19 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import should_collect_more_steps
+from stable_baselines3.common.utils import get_device, should_collect_more_steps
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
-from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, Run, Settings, write_json
+from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, STOPPED, Run, Settings, write_json
 from sb3_eqr.common.resets import Resets
 from sb3_eqr.common.saving import checkpoints
 from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints, write_checkpoint
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.models import SafeFiles
 from sb3_eqr.common.saving.plain_data import decode
-from sb3_eqr.zoo import register
+from sb3_eqr.zoo import AGENTS, register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
 PROGRESS_SECONDS = 2.0  # between writes of a run's progress
@@ -97,10 +97,14 @@ class Clock:
         self._last = now
 
 
+class OutOfTime(Exception):
+    """``settings.stop_at`` has passed, and the checkpoint is written."""
+
+
 class RunCallback(BaseCallback):
     """
     Records training scores and progress, evaluates, writes checkpoints, and stops after exactly the requested steps; a rollout
-    that these steps cut short is not trained on.
+    that these steps cut short is not trained on. Raises ``OutOfTime`` between two rollouts.
 
     :param run: the run
     :param record: the measurements so far
@@ -123,11 +127,14 @@ class RunCallback(BaseCallback):
         self.note_progress()
 
     def _on_rollout_start(self) -> None:
-        if time.monotonic() - self.saved >= self.settings.checkpoint_seconds:
+        is_over = self.settings.is_over()
+        if is_over or time.monotonic() - self.saved >= self.settings.checkpoint_seconds:
             self.clock.read("training_seconds")
             write_checkpoint(self.run.folder, self.model, self.record)
             self.clock.read("seconds")
             self.saved = time.monotonic()
+        if is_over:
+            raise OutOfTime
 
     def _on_step(self) -> bool:
         for info in self.locals.get("infos", []):
@@ -197,7 +204,6 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     """
     Build the agent as RL Zoo does, on environments that write no files.
 
-    :param logs: folder for the files that RL Zoo writes next to a model
     :return: the agent, and RL Zoo's manager, which has the callbacks of its entry and saves the agent
     """
     env_id, kwargs = run.protocol["env_id"], run.entry.get("env_kwargs")
@@ -205,6 +211,8 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     with tempfile.TemporaryDirectory() as aside, silence():
         config = pathlib.Path(aside) / "entry.yml"
         entry = {key: value for key, value in run.entry.items() if value is not None or key not in WORLD}  # null: none
+        if run.agent.algo in AGENTS and get_device(settings.device).type == "cuda":
+            entry = {"cuda_graph": True, **entry}
         config.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
         manager = ExperimentManager(
             args,
@@ -286,15 +294,22 @@ def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, 
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
     device = th.cuda.get_device_name(model.device) if model.device.type == "cuda" else model.device.type
+    captured: Any = getattr(model, "_captured", None)  # as a CUDA graph
+    updates = "eager" if captured is None else f"eager: {captured.failure}" if captured.failure else "captured"
+    machine = {"device": device, "updates": updates, "threads": th.get_num_threads()}
     return {
         **run.description(),
         "versions": {"python": platform.python_version(), **versions},
-        "machine": {"device": device, "threads": settings.n_threads, "platform": platform.platform(), "host": platform.node()},
+        "machine": {**machine, "platform": platform.platform(), "host": platform.node()},
     }
 
 
-def train(run: Run, settings: Settings) -> None:
-    """Train, evaluate, write ``result.json``; an interrupted run resumes from its last checkpoint."""
+def train(run: Run, settings: Settings) -> str:
+    """
+    Train, evaluate, write ``result.json``; an interrupted run resumes from its last checkpoint.
+
+    :return: "finished", or "stopped" if ``settings.stop_at`` came first: then a checkpoint and ``stopped.json`` are written
+    """
     started = time.monotonic()
     envs.register()
     envs.import_packages(settings.gym_packages)
@@ -316,32 +331,47 @@ def train(run: Run, settings: Settings) -> None:
     if model.num_timesteps < steps:
         model.set_logger(Logger(folder=None, output_formats=[LossWriter(record["losses"])]))
         callback = RunCallback(run, record, settings)
-        model.learn(steps - model.num_timesteps, [*manager.callbacks, callback], reset_num_timesteps=not found)
+        try:
+            model.learn(steps - model.num_timesteps, [*manager.callbacks, callback], reset_num_timesteps=not found)
+        except OutOfTime:
+            row = {
+                "stopped_at": model.num_timesteps,
+                **provenance(run, model, settings),
+                **times(run, model, record),
+                **record,
+            }
+            write_json(run.folder / STOPPED, row)
+            return "stopped"
         write_checkpoint(run.folder, model, record, with_buffer=False)
     finishing = Clock(record)
     add_evaluation(model, run, record, "final", run.protocol["evaluation"]["episodes"])
     finishing.read("seconds")
-    starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
-    times = {
-        "started": starts[0],
-        "attempts": len(starts),
-        "wall_clock_s": round(record.pop("seconds"), 2),
-        "steps_per_second": round(steps / max(record["training_seconds"], 1e-9), 2),
-    }
     if settings.save_models:
         save_model(model, manager, run, logs)
         shutil.rmtree(models, ignore_errors=True)
         logs.rename(models)
-    write_json(run.folder / RESULT, {**provenance(run, model, settings), **times, **record})
+    write_json(run.folder / RESULT, {**provenance(run, model, settings), **times(run, model, record), **record})
     model.get_env().close()  # type: ignore[union-attr]
     remove_checkpoints(run.folder)
+    return "finished"
+
+
+def times(run: Run, model: BaseAlgorithm, record: dict[str, Any]) -> dict[str, Any]:
+    """:return: when the run started and how long it took; the record's "seconds" are moved into it"""
+    starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
+    return {
+        "started": starts[0],
+        "attempts": len(starts),
+        "wall_clock_s": round(record.pop("seconds"), 2),
+        "steps_per_second": round(model.num_timesteps / max(record["training_seconds"], 1e-9), 2),
+    }
 
 
 def execute(run: Run, settings: Settings) -> str:
     """
     Start or resume a run and finish it. Only one process at a time can hold a run.
 
-    :return: "finished", or "busy" if another process holds the run
+    :return: "finished", "stopped", or "busy" if another process holds the run
     :raises Exception: whatever stopped the run; the traceback is in ``error.txt``, and the last checkpoint is complete
     """
     run.folder.mkdir(parents=True, exist_ok=True)
@@ -351,16 +381,17 @@ def execute(run: Run, settings: Settings) -> str:
                 remove_checkpoints(run.folder)  # left by a process that was killed after writing the result
                 return "finished"
             th.set_num_threads(settings.n_threads)
+            (run.folder / ERROR).unlink(missing_ok=True)  # of an earlier attempt
             try:
-                train(run, settings)
+                outcome = train(run, settings)
             except (Exception, SystemExit) as error:
                 with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
                     file.write(traceback.format_exc().encode())
                 if isinstance(error, SystemExit):  # would also end Ray's worker
                     raise RuntimeError(f"{run.agent.file} cannot be used (exit {error.code})") from error
                 raise
-            for name in (ERROR, PROGRESS, STARTS):
+            for name in (PROGRESS, *((STARTS, STOPPED) if outcome == "finished" else ())):
                 (run.folder / name).unlink(missing_ok=True)
-            return "finished"
+            return outcome
     except Timeout:
         return "busy"

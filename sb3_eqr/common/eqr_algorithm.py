@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
@@ -294,9 +295,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         validation.check_env(env)
-        with validation.environment_errors(0):
-            observation_space = env.observation_space
-        validation.check_observation_space(observation_space)
+        if isinstance(found := getattr(env, "observation_space", None), spaces.Space):
+            validation.check_observation_space(found)
         with validation.environment_errors(0):
             wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         validation.check_action_space(wrapped.action_space)

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
-from benchmarks.attacks.inputs import wrong_arguments
+from experiments.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.eqr_rainbow import eqr_rainbow
 from tests.models import EITHER, PAPER, SMALL, loss_terms

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from benchmarks.state_signal import signal
+from experiments.state_signal import signal
 from sb3_eqr import EqRQRDQN, EqRRainbow, GroupFeaturesExtractor, load_configuration
 from sb3_eqr.common.networks.target_copy import TargetCopy
 from sb3_eqr.envs import make_atari100k_env

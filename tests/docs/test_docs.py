@@ -37,7 +37,7 @@ import sb3_eqr.zoo.__main__ as zoo_command
 import sb3_eqr.zoo.hub
 from sb3_eqr import ExactCheckpointCallback, cli
 from sb3_eqr.benchmark.agents import find_agent
-from sb3_eqr.benchmark.suites import choose, load_suite, make_suite
+from sb3_eqr.benchmark.suites import choose, load_suite, make_suite, write_suite
 from sb3_eqr.zoo.entries import check_entry
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -158,6 +158,7 @@ def command_lines(text):
 def check_command(words):
     """Fail unless the program, which is the first word, can parse the other words."""
     program, arguments = words[0], words[1:]
+    assert all((ROOT / word).is_file() for word in words if word.startswith("docs/results/") and word.endswith(".xz")), words
     if program == "pip":
         check_pip(arguments)
     elif program == "make":
@@ -205,8 +206,8 @@ def check_sb3_eqr(arguments):
         if args.suite_file is None:
             choose(load_suite(args.suite), args.games, args.steps)
         for agent in args.agents:
-            if not agent.endswith(".yml"):  # such a file is the reader's
-                find_agent(agent)
+            if "experiments/" in agent or ".yml" not in agent:  # other files are the reader's
+                find_agent(agent.replace("experiments/", f"{ROOT}/experiments/"))
 
 
 def check_script(call, arguments):
@@ -284,10 +285,11 @@ def write_a_benchmark(folder):
     """One finished run, with the fields that ``load_scores`` reads."""
     evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
     training = {"step": [100], "score": [100.0], "length": [100]}
-    names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}
+    names, others = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}, {"protocol": {}, "entry": {}, "losses": []}
     run = folder / "runs" / "eqr_qrdqn" / "CartPole-v1" / "0"
     run.mkdir(parents=True)
-    (run / "result.json").write_text(json.dumps({**names, "evaluations": [evaluation], "training": training}))
+    write_suite(load_suite("smoke"), folder / "suite.yml")
+    (run / "result.json").write_text(json.dumps({**names, **others, "evaluations": [evaluation], "training": training}))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -349,7 +351,6 @@ STORY = [  # lines of the pages in a working order, and arguments that shorten t
     ("sb3-eqr benchmark status results/smoke", ""),
     ("sb3-eqr benchmark report results/smoke", ""),
     ("python examples/demo.py --game Boxing --config se2+aet --steps 100000", "--steps 30 --eval-episodes 1"),
-    ("python examples/cartpole.py --seeds 0 1 2 3 4", "--seeds 0 --steps 1100"),
     (
         "python examples/blind_cliffwalk.py --seeds 10 --json docs/results/cliffwalk.json",
         "--seeds 1 --states 2 --json cliffwalk.json",

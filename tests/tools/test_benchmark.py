@@ -1,23 +1,26 @@
-"""The command line of the benchmark, from an empty folder to a report, on Ray."""
+"""The command line of the benchmark, from an empty folder to a report."""
 
 import dataclasses
 import json
 import pathlib
+import signal
+import subprocess
 import sys
-from types import SimpleNamespace
+import time
 
 import pytest
 import yaml
 from filelock import FileLock
 from gymnasium import spaces
 from ray.cluster_utils import Cluster
-from ray.exceptions import RayError
 from rich.console import Console
 from rl_zoo3.utils import ALGOS
 
 from sb3_eqr import benchmark, cli
 from sb3_eqr.benchmark import dispatch
 from sb3_eqr.benchmark.agents import find_agent, hyperparameters
+from sb3_eqr.benchmark.commands import read_seeds
+from sb3_eqr.benchmark.evaluation import make_game
 from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
@@ -41,6 +44,8 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     pathlib.Path("own.yml").write_text(yaml.safe_dump({"tiny": SUITE}))
+    named = "three: {base: fast.yml, changes: {gamma: 0.3}}\ntwo: {base: fast.yml, changes: {gamma: 0.2}}\n"
+    pathlib.Path("named.yml").write_text(named)
     pathlib.Path("fast.yml").write_text(f"CartPole-v1: {FAST}\nAcrobot-v1: {FAST}\n")
     return tmp_path
 
@@ -70,7 +75,7 @@ def test_from_an_empty_folder_to_scores(files, sb3_eqr, cluster):
     code, out = sb3_eqr(f"{line} --games cartpole --seeds 1")
     assert code == 0 and "qrdqn:fast, CartPole, seed 0: finished" in out.out
     before = {path: path.stat().st_mtime for path in files.glob("b/runs/*/*/*/result.json")}
-    code, out = sb3_eqr(f"{line} --seeds 2 --address {cluster}")  # more seeds and another game
+    code, out = sb3_eqr(f"{line} --seeds 2 --ray {cluster}")  # more seeds and another game
     assert code == 0 and "2 of 8 runs are already finished." in out.out and "CartPole, seed 0: finished" not in out.out
     results = {path: json.loads(path.read_text()) for path in files.glob("b/runs/*/*/*/result.json")}
     assert len(results) == 8 and all(path.stat().st_mtime == time for path, time in before.items())
@@ -96,43 +101,56 @@ BROKEN = f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 4, max_grad_
 
 
 @pytest.mark.slow
-def test_ray_tries_a_crashed_run_twice_while_the_others_continue(files, sb3_eqr, cluster):
-    pathlib.Path("broken.yml").write_text(BROKEN)
-    line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1"
-    line += f" --address {cluster}"
+def test_processes_that_crash_or_lose_their_parent(files, sb3_eqr):
+    (files / "broken.yml").write_text(BROKEN)
+    line = "run b --suite tiny --suite-file own.yml --games CartPole --agents dqn:broken.yml dqn:fast.yml --seeds 1 --jobs 2"
     code, out = sb3_eqr(line)
-    assert "Note: dqn:broken makes" not in out.out
-    assert code == 1 and out.out.count("crashed (") == 2 and "dqn:fast, CartPole, seed 0: finished" in out.out
-    assert "failed: dqn:broken, CartPole, seed 0:" in out.out
-    assert json.loads(pathlib.Path("b/runs/dqn-fast/CartPole/0/result.json").read_text())["attempts"] == 1
-    code, out = sb3_eqr("status b")
-    assert "failed: dqn:broken, CartPole, seed 0: ValueError: could not convert" in out.out
-    pathlib.Path("broken.yml").write_text(pathlib.Path("fast.yml").read_text())
-    code, out = sb3_eqr(line)
-    assert code == 0 and [run.state().name for run in read_plan(pathlib.Path("b"))] == ["done", "done"]
+    assert code == 1 and out.out.count("crashed (ValueError: could not convert") == 2
+    assert "dqn:fast, CartPole, seed 0: finished" in out.out and "failed: dqn:broken, CartPole, seed 0:" in out.out
+    result = json.loads((files / "b/runs/dqn-fast/CartPole/0/result.json").read_text())
+    assert result["attempts"] == 1 and result["machine"]["threads"] == 1
+    assert "could not convert" in (files / "b/runs/dqn-broken/CartPole/0/log.txt").read_text()
+    call = "import sys; sys.argv = sys.argv[:1] + {}; from sb3_eqr.cli import main; main()"
+    words = ["benchmark", *f"{RUN} --games CartPole --seeds 1 --steps 1000000".replace(" b ", " c ").split()]
+    run = files / "c/runs/dqn-fast/CartPole/0"
+    for sent, status in ((signal.SIGINT, 2), (signal.SIGKILL, -signal.SIGKILL)):
+        process = subprocess.Popen([sys.executable, "-c", call.format(words)], stderr=subprocess.PIPE, start_new_session=True)
+        wait_until(lambda: (run / "progress.json").is_file())
+        process.send_signal(sent)
+        shown = process.communicate(timeout=60)[1].decode()
+        assert process.returncode == status and "Traceback" not in shown
+        assert ("interrupted. The same command continues" in shown) == (status == 2)
+        wait_until(lambda: not read_plan(files / "c")[0].is_locked())
+        (run / "progress.json").unlink(missing_ok=True)
 
 
-class Crash(RayError):
-    def __init__(self, cause):
-        self.cause = cause
+def wait_until(holds, seconds=60):
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.1)
 
 
-class InOneProcess:
-    """Replaces Ray: does a run in this process when its result is requested."""
+class InThisProcess:
+    """Executes a run when its outcome is requested."""
 
-    exceptions = SimpleNamespace(RayError=RayError)
+    slots = 1
 
-    def remote(self, run, settings):
-        return lambda: execute(run, settings)
+    def __init__(self):
+        self.started = []
 
-    def wait(self, references, timeout):
-        return references[:1], references[1:]
+    def start(self, run):
+        self.started.append(run)
+        return len(self.started) - 1
 
-    def get(self, reference):
+    def wait(self, handles, timeout):
+        return handles[:1]
+
+    def outcome(self, handle):
         try:
-            return reference()
+            return execute(self.started[handle], Settings())
         except ValueError as error:
-            raise Crash(error) from error
+            raise dispatch.Crash(f"ValueError {error}") from error
 
 
 def test_a_crashed_run_is_tried_twice_and_reported_while_the_others_continue(files, sb3_eqr, capfd):
@@ -140,10 +158,10 @@ def test_a_crashed_run_is_tried_twice_and_reported_while_the_others_continue(fil
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
 
     def all_runs():
-        runs = plan_runs(files / "b", suite, ["dqn:broken.yml", "dqn:fast.yml"], 1)
+        runs = plan_runs(files / "b", suite, ["dqn:broken.yml", "dqn:fast.yml"], [0])
         write_plan(files / "b", suite, runs)
-        ray, waiting = InOneProcess(), [run for run in runs if run.state().name != "done"]
-        failed = dispatch.finish(ray, ray, runs, waiting, Settings(), Console())
+        waiting = [run for run in runs if run.state().name != "done"]
+        failed = dispatch.finish(InThisProcess(), runs, waiting, Settings(), Console())
         return [run.agent.name for run in failed], capfd.readouterr().out
 
     failed, out = all_runs()
@@ -186,7 +204,12 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite smoke --agents eqr_rainbow:se2+aet+", "got one of se2+aet+get, se2+aet+r, se2+aet+r+get. Choose one"),
         ("run b --suite smoke --agents dqn:other.yml", "'dqn:other.yml': there is no file other.yml"),
         ("status b", "got one without runs"),
-        (f"{RUN} --seeds 0", "--seeds must be >= 1, got 0"),
+        (f"{RUN} --seeds 0", "--seeds must be >= 1, or different seeds >= 0 such as 1,3; got 0"),
+        (f"{RUN} --jobs 0", "--jobs must be >= 1, got 0"),
+        (f"{RUN} --stop-after 0", "--stop-after must be > 0 seconds, got 0"),
+        (f"{RUN} --gpus-per-run 1", "--gpus-per-run needs --ray, got 1 without it"),
+        (f"{RUN} --episodes 0", "--episodes must be >= 1, got 0"),
+        ("run b --suite tiny --suite-file own.yml --agents dqn:named.yml:thre", "has no agent 'thre'. Did you mean 'three'"),
         (f"{RUN} --steps 0", "--steps must be >= 1, got 0"),
         (f"{RUN} --cpus-per-run 0", "--cpus-per-run"),
         (f"{RUN} --device cuda:7", "PyTorch finds no GPU"),
@@ -201,40 +224,40 @@ def test_wrong_use_prints_an_error(files, sb3_eqr, line, message):
 
 @pytest.mark.slow
 def test_runs_that_need_too_many_cpus_print_an_error(files, sb3_eqr, cluster):
-    code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --address {cluster}")
+    code, out = sb3_eqr(f"{RUN} --seeds 1 --cpus-per-run 2 --ray {cluster}")
     assert code == 2 and "--cpus-per-run must be <= 1, the CPUs of the largest machine, got 2" in out.err
 
 
 def test_an_unreachable_cluster_prints_an_error(files, sb3_eqr):
-    code, out = sb3_eqr(f"{RUN} --seeds 1 --address 127.0.0.1:1")
+    code, out = sb3_eqr(f"{RUN} --seeds 1 --ray 127.0.0.1:1")
     assert code == 2 and "127.0.0.1:1" in out.err
 
 
 def test_runs_with_different_settings_cannot_share_a_folder(files):
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
-    benchmark_plan = plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
+    benchmark_plan = plan_runs(files / "b", suite, ["dqn:fast.yml"], [0])
     write_plan(files / "b", suite, benchmark_plan)
-    plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)  # no run has started yet
+    plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], [0])  # no run has started yet
     (benchmark_plan[0].folder / "result.json").write_text("{}")
     with pytest.raises(ValueError, match="steps must be 60, as when the run was started, got 70"):
-        plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], 1)
+        plan_runs(files / "b", choose(suite, None, 70), ["dqn:fast.yml"], [0])
     (files / "fast.yml").write_text(f"CartPole-v1: {FAST.replace('batch_size: 4', 'batch_size: 8')}")
     with pytest.raises(ValueError, match=r"hyperparameters.batch_size must be 4, as when the run was started, got 8"):
-        plan_runs(files / "b", suite, ["dqn:fast.yml"], 1)
-    with pytest.raises(ValueError, match="must hold a benchmark of suite 'smoke', got 'tiny'"):
+        plan_runs(files / "b", suite, ["dqn:fast.yml"], [0])
+    with pytest.raises(ValueError, match="must be of suite 'tiny', as those that are there, got 'smoke'"):
         write_plan(files / "b", load_suite("smoke"), [])
 
 
 def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, monkeypatch):
     suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None)
-    (run,) = plan_runs(files / "b", suite, ["eqr_rainbow"], 1)
+    (run,) = plan_runs(files / "b", suite, ["eqr_rainbow"], [0])
     assert run.defaults["td_coef"] == 1.0 and run.defaults["policy_kwargs"]["n_atoms"] == 51
     assert "learning_starts" not in run.defaults  # which the entry has
     write_plan(files / "b", suite, [run])
     (run.folder / "result.json").write_text("{}")
     monkeypatch.setattr(EqRRainbowPolicy.__init__, "__defaults__", (11, *EqRRainbowPolicy.__init__.__defaults__[1:]))
     with pytest.raises(ValueError, match=r"policy_kwargs.n_atoms must be 51, as when the run was started, got 11"):
-        plan_runs(files / "b", suite, ["eqr_rainbow"], 1)
+        plan_runs(files / "b", suite, ["eqr_rainbow"], [0])
     assert with_present_defaults([run]) == [run]  # it is finished
     (run.folder / "result.json").unlink()
     (waiting,) = with_present_defaults([run])
@@ -253,8 +276,9 @@ def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, monk
 
 def test_missing_ray_prints_an_error(files, sb3_eqr, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    code, out = sb3_eqr(RUN)
-    assert code == 2 and 'Ray is not installed. Run pip install ".[benchmark]" in a clone of the repository' in out.err
+    monkeypatch.delitem(sys.modules, "sb3_eqr.benchmark.cluster", raising=False)
+    code, out = sb3_eqr(f"{RUN} --ray")
+    assert code == 2 and "ray" in out.err and 'Run pip install ".[cluster]" in a clone of the repository' in out.err
 
 
 def test_the_command_without_its_extra(monkeypatch):
@@ -275,6 +299,8 @@ def test_the_command_without_its_extra(monkeypatch):
     "change, message",
     [
         ({"step": 1}, "unknown key 'step'. Did you mean 'steps'"),
+        ({"steps": None, "step": 1}, "unknown key 'step'. Did you mean 'steps'"),
+        ({"env_id": {"CartPole": "CartPole-v1"}}, "env_id must have every game, got none for Acrobot"),
         ({"steps": {"CartPole": 10}}, "steps must have every game, got none for Acrobot"),
         ({"steps": 0}, "steps: CartPole: input should be greater than 0, got 0"),
         ({"evaluation": {"episodes": 1, "n_envs": 1}}, "evaluation: curve must be set, got nothing"),
@@ -294,7 +320,11 @@ def test_the_command_without_its_extra(monkeypatch):
     ],
 )
 def test_invalid_suites_raise(files, change, message):
-    (files / "own.yml").write_text(yaml.safe_dump({"tiny": {**SUITE, **change}}))
+    (files / "own.yml").write_text(
+        yaml.safe_dump(
+            {"tiny": {key: value for key, value in (SUITE | change).items() if value or key != "steps" or value == 0}}
+        )
+    )
     with pytest.raises(ValueError, match=message):
         choose(load_suite("tiny", files / "own.yml"), None, None)
 
@@ -321,34 +351,49 @@ def test_atari_suites_with_the_wrong_evaluation_environment_raise(files, preproc
     (files / "own.yml").write_text(yaml.safe_dump({"tiny": entry}))
     suite = choose(load_suite("tiny", files / "own.yml"), None, None)
     with pytest.raises(ValueError, match=message):
-        plan_runs(files / "b", suite, ["qrdqn:stock"], 1)
+        plan_runs(files / "b", suite, ["qrdqn:stock"], [0])
 
 
 def test_a_replay_buffer_is_no_larger_than_the_run(files):
     """The default of QRDQN is 1,000,000, which is 56 GB of Atari frames."""
     suite = choose(load_suite("smoke"), None, None)
-    runs = plan_runs(files / "b", suite, ["qrdqn", "eqr_qrdqn", "dqn:fast.yml", "ppo"], 1)
+    runs = plan_runs(files / "b", suite, ["qrdqn", "eqr_qrdqn", "dqn:fast.yml", "ppo"], [0])
     assert [run.entry.get("buffer_size") for run in runs] == [3_000, 3_000, 99, None]
 
 
-@pytest.mark.parametrize("cause", [AssertionError(), ValueError("[/tmp/x] [cpu]\nthe [last] line"), None])
-def test_a_crash_without_message_or_with_brackets_does_not_stop_the_others(files, cause, capsys, monkeypatch):
-    """Nor does a disk that is too full to save the error."""
-    runs = plan_runs(files / "b", choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None), ["dqn:fast.yml"], 1)
-
-    def get(reference):
-        raise Crash(cause)
+def test_a_crash_on_a_full_disk_does_not_stop_the_others(files, capsys, monkeypatch):
+    """Its message may look like markup."""
+    runs = plan_runs(files / "b", choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None), ["dqn:fast.yml"], [0])
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
+    class Crashing(InThisProcess):
+        def outcome(self, handle):
+            raise dispatch.Crash("the [last] line")
+
     monkeypatch.setattr(dispatch, "atomic_write", full)
-    attempts = iter(("first", "second"))
-    exceptions = SimpleNamespace(RayError=RayError)
-    fake = SimpleNamespace(get=get, exceptions=exceptions, wait=lambda references, timeout: (references, []))
-    task = SimpleNamespace(remote=lambda run, settings: next(attempts))
-    assert dispatch.finish(fake, task, runs, runs, Settings(), Console()) == runs
-    assert capsys.readouterr().out.count("dqn:fast, CartPole, seed 0: crashed (") == 2
+    assert dispatch.finish(Crashing(), runs, runs, Settings(), Console()) == runs
+    assert capsys.readouterr().out.count("dqn:fast, CartPole, seed 0: crashed (the [last] line)") == 2
+
+
+def test_nothing_starts_after_the_time_to_stop(files):
+    runs = plan_runs(files / "b", choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None), ["dqn:fast.yml"], [0, 3])
+    pool = InThisProcess()
+    assert dispatch.finish(pool, runs, runs, Settings(stop_at=time.time() - 1), Console()) == []
+    assert pool.started == []
+
+
+@pytest.mark.parametrize(
+    "text, first, seeds",
+    [("2", 0, [0, 1]), ("2", 3, [3, 4]), ("1,3", 0, [1, 3]), ("0,", 0, None), ("1,1", 0, None), ("1,2", 1, None)],
+)
+def test_seeds(text, first, seeds):
+    if seeds is None:
+        with pytest.raises(ValueError, match="seed"):
+            read_seeds(text, first)
+    else:
+        assert read_seeds(text, first) == seeds
 
 
 def test_our_suites(tmp_path):
@@ -357,7 +402,7 @@ def test_our_suites(tmp_path):
     assert {game.lower() for game in atari.games} == set(reference["game"]) and set(atari.steps.values()) == {100_000}
     assert atari.normalisation.scores["Pong"] == [-20.7, 14.6]  # the paper's Table 2
     assert load_suite("atari100k-5").games == ["Assault", "BattleZone", "Boxing", "ChopperCommand", "Qbert"]
-    for name in ("atari100k", "atari100k-5", "minatar", "classic", "smoke", "smoke-atari"):
+    for name in ("atari100k", "atari100k-5", "minatar", "classic", "worlds", "smoke", "smoke-atari"):
         suite = choose(load_suite(name), None, None)
         assert suite.normalisation.scores.keys() == set(suite.games), name
         assert all(high > low for low, high in suite.normalisation.scores.values())
@@ -373,6 +418,27 @@ def test_agents_and_their_files():
     assert find_agent("eqr_rainbow").file.parent.name == "zoo_hyperparams"
     assert find_agent("eqr_rainbow:se2+aet").file.name == "se2+aet.yml"  # and not se2+aet+r
     assert find_agent("eqr_rainbow:mlp").name == "eqr_rainbow:mlp+aet+r"
+
+
+def test_several_agents_in_one_file(files):
+    suite = choose(load_suite("tiny", files / "own.yml"), ["CartPole"], None, episodes=3)
+    runs = plan_runs(files / "b", suite, ["dqn:named.yml:two", "dqn:named.yml:three", "dqn:fast.yml"], [5])
+    assert [(run.agent.name, run.entry.get("gamma")) for run in runs] == [
+        ("dqn:two", 0.2),
+        ("dqn:three", 0.3),
+        ("dqn:fast", None),
+    ]
+    assert runs[0].entry["batch_size"] == 4 and runs[0].protocol["evaluation"]["episodes"] == 3
+
+
+def test_our_environments_are_a_suite(files):
+    """With the arguments of each, in training and evaluation."""
+    suite = choose(load_suite("worlds"), None, 100)
+    runs = {run.game: run for run in plan_runs(files / "b", suite, ["eqr_rainbow"], [0])}
+    assert {runs[game].protocol["env_id"] for game in runs} >= {"SlidingBallTorus-v0", "StarField-v0", "BlindCliffwalk-v0"}
+    assert runs["torus_of_8"].entry["env_kwargs"]["n_distractors"] == 8
+    env = make_game(runs["torus_of_4"].protocol)
+    assert env.unwrapped.n_distractors == 4 and env.unwrapped.n_steps == 16
 
 
 @pytest.mark.parametrize("off, same", [("eqr_qrdqn:off", "eqr_qrdqn:qrdqn"), ("eqr_rainbow:off", "eqr_rainbow:rainbow")])
@@ -396,5 +462,5 @@ def test_an_entry_without_eqr_builds_its_agent(algo):
 
 
 def test_scores_without_runs(tmp_path):
-    with pytest.raises(ValueError, match="got one without finished runs"):
+    with pytest.raises(ValueError, match=r"got one without suite\.yml"):
         benchmark.load_scores(tmp_path)

@@ -8,6 +8,7 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from filelock import FileLock
 from rl_zoo3.utils import create_test_env, get_saved_hyperparams
@@ -16,12 +17,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from benchmarks import packed_runs
 from sb3_eqr.benchmark import runs, training
 from sb3_eqr.benchmark.agents import Agent, find_agent
 from sb3_eqr.benchmark.evaluation import evaluate, make_evaluation_env
-from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, SUITE, Run, Settings
-from sb3_eqr.benchmark.scores import load_results
+from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, STOPPED, SUITE, Run, Settings
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
@@ -35,7 +34,7 @@ OFF_POLICY = "  learning_starts: 40\n  batch_size: 8\n  train_freq: 8\n  gradien
 NORMALISED = "  normalize: {norm_obs: true, norm_reward: true}\n"
 EQR = SHARED.replace("[16]", "[16], n_blocks: 2") + OFF_POLICY + "  n_steps: 3\n  prediction_depth: 2\n"
 AGENTS = {
-    "eqr_rainbow": EQR.replace("}", ", v_min: 0.0, v_max: 100.0}") + NORMALISED + "  resets: {interval: 12, end: 0.8}\n",
+    "eqr_rainbow": EQR.replace("}", ", v_min: 0.0, v_max: 100.0}") + NORMALISED + "  resets: {interval: 12}\n",
     "qrdqn": SHARED + OFF_POLICY + "  n_steps: 3\n",
     "dqn": SHARED + OFF_POLICY + "  n_envs: 2\n" + NORMALISED,
     "ppo": SHARED + "  n_envs: 2\n  n_steps: 16\n  batch_size: 8\n  n_epochs: 1\n",
@@ -423,28 +422,30 @@ def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
     assert result["training"]["step"] and result["evaluations"][-1]["step"] == 300
 
 
-def test_packed_runs_come_back(tmp_path):
-    """In two parts, which the file keeps, with the suite, without unfinished runs and the machine's folders."""
-    file, back = tmp_path / "all.jsonl.xz", tmp_path / "back"
-    plan = {"agent": "dqn", "game": "Boxing", "suite": "atari100k-5", "protocol": {"steps": 9}, "entry": {}}
-    plan |= {"defaults": {"gamma": 0.9}}
-    plan["command"] = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml"
-    for seed in (0, 1):
-        path = tmp_path / f"part{seed}" / "runs" / "dqn" / "Boxing" / str(seed) / RESULT
-        path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(plan | {"seed": seed, "evaluations": [{"scores": [0.5]}]}).replace("TOP", "/a/b-1"))
-        assert packed_runs.pack(tmp_path / f"part{seed}", file) == seed + 1
-    unfinished = tmp_path / "part2" / "runs" / "dqn" / "Boxing" / "2" / RESULT
-    unfinished.parent.mkdir(parents=True)
-    unfinished.write_text('{"evaluations": []}')
-    assert packed_runs.pack(tmp_path / "part2", file) == 3
-    assert [packed_runs.unpack(back, file) for _ in range(2)] == [2, 0]
-    found = load_results(back)
-    assert [run["seed"] for run in found] == [0, 1] and found[1]["evaluations"] == [{"scores": [0.5]}]
-    command = "run here --agents dqn:a.yml dqn:settings/b.yml"
-    assert json.loads((back / "runs/dqn/Boxing/1/run.json").read_text()) == plan | {"seed": 1, "command": command}
-    suite = read_suite(back / SUITE)
-    assert (suite.name, suite.games, suite.steps) == ("atari100k-5", ["Boxing"], {"Boxing": 9})
+def test_a_run_is_stopped_after_a_time_and_continues(tmp_path, monkeypatch):
+    """With a row and a checkpoint; then it has the scores of a run that was not stopped."""
+    undisturbed, stopped = make_run(tmp_path / "undisturbed", "qrdqn"), make_run(tmp_path / "stopped", "qrdqn")
+    execute(undisturbed, Settings())
+    ends = iter([False] * 10 + [True])
+    with monkeypatch.context() as patch:
+        patch.setattr(Settings, "is_over", lambda settings: next(ends))
+        assert execute(stopped, Settings()) == "stopped"
+    row = json.loads((stopped.folder / STOPPED).read_text())
+    assert row["stopped_at"] == 80 and row["training"]["step"][-1] <= 80 and row["machine"]["threads"] == 1
+    assert [path.name for path in find_checkpoints(stopped.folder)] == ["checkpoint-000000000080"]
+    assert stopped.state().name == "waiting" and stopped.state().step == 80
+    assert execute(stopped, Settings(stop_at=time.time() + 600)) == "finished"
+    assert scores_of(stopped) == scores_of(undisturbed) and not (stopped.folder / STOPPED).exists()
+
+
+@pytest.mark.parametrize("device, expected", [("cuda", True), ("cpu", None)])
+def test_our_agents_capture_their_updates_on_a_gpu(tmp_path, monkeypatch, device, expected):
+    asked = {}
+    monkeypatch.setattr(training, "get_device", th.device)
+    monkeypatch.setattr(training.yaml, "safe_dump", lambda entry: asked.update(entry["CartPole-v1"]) or "{}")
+    with pytest.raises((ValueError, SystemExit, KeyError)):
+        training.build(make_run(tmp_path, "eqr_rainbow"), Settings(device=device), tmp_path)
+    assert asked.get("cuda_graph") is expected
 
 
 @pytest.mark.parametrize("algo, n_updates", [("eqr_rainbow", 30), ("qrdqn", 30), ("ppo", 5)])

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import sb3_eqr
-from benchmarks import installation
+from experiments import installation
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.envs import make_atari100k_env

@@ -8,16 +8,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from rliable import library, metrics
+from scipy.stats import t
 
 from sb3_eqr.benchmark import figures
 from sb3_eqr.benchmark import report as report_module
 from sb3_eqr.benchmark.analysis import analyse, conclusion, difference_in_words
 from sb3_eqr.benchmark.comparison import compare
-from sb3_eqr.benchmark.figures import all_figures, normalized_curves, symmetry_losses
+from sb3_eqr.benchmark.figures import all_figures, normalized_curves
+from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.reference import SHOWN, published_means
 from sb3_eqr.benchmark.report import write_report
+from sb3_eqr.benchmark.scores import load_scores
 from sb3_eqr.benchmark.suites import make_suite, write_suite
-from sb3_eqr.benchmark.tables import make_table, number, to_html, to_latex, to_markdown
+from sb3_eqr.benchmark.tables import difference_table, make_table, number, to_html, to_markdown
 from sb3_eqr.plot_style import looks
 
 PONG, BOXING, KRULL = [-20.7, 14.6], [0.1, 12.1], [1598.0, 2665.5]  # Table 2: random, human
@@ -177,13 +180,10 @@ def test_the_table_of_games(report):
         and "<td>−12.0<br><small>± 2.0</small></td>" in page
     )
     lines = [re.sub(" +", " ", line) for line in report.with_name("table.md").read_text().splitlines()]
-    rows = {line[2:].partition(" |")[0]: line for line in lines}
+    rows = {line[2:].partition(" |")[0]: line for line in reversed(lines)}  # without the second table, of differences
     assert rows["Krull"].startswith("| Krull | 1,598 | 2,666 | 1,798 ± 200 | 3,000 ± 200 | 3,033 ± 306 |")
     assert "| 12.0 ± 2.0 | 12.0 ± 3.0 |" in rows["Boxing"]
     assert rows["minutes per run"].startswith("| minutes per run | | | 30.0 | 30.0 | 30.0 | – |")
-    tex = report.with_name("table.tex").read_text()
-    assert r"eqr\_rainbow:se2+aet+r" in tex and r"3,033 $\pm$ 306" in tex and "bfseries" not in tex
-    assert "eqr_rainbow" not in "".join(line for line in tex.splitlines(keepends=True) if not line.startswith("%"))
 
 
 def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
@@ -191,22 +191,17 @@ def test_the_best_agent_is_bold_if_the_runs_distinguish_it(tmp_path, not_drawn):
     apart, alike = [9.0, 10.0, 11.0, 10.0], [9.1, 10.1, 11.1, 10.1]
     scores = {"dqn": {"Pong": apart, "Boxing": apart}, FULL: {"Pong": [2 * score for score in apart], "Boxing": alike}}
     page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=100)
-    assert re.findall("<b>(.*?)</b>", page.read_text())[1:] == ["20.0", "1.000"]  # the first is the IQM of the summary
-    assert r"\bfseries 20.0 $\pm$ 1.6" in page.with_name("table.tex").read_text()
+    assert re.findall("<b>(.*?)</b>", page.read_text()) == ["20.0", "1.000"]
     assert "**20.0** ± 1.6" in page.with_name("table.md").read_text()
-    assert f"{FULL} is better than dqn: its IQM is" in text_of(page).partition("Aggregates</h2>")[0]
+    assert f"{FULL} is better than dqn: its IQM is" in text_of(page).partition("Scores</h2>")[0]
 
 
 def test_the_files_of_a_report(drawn, report):
-    names = {"profiles", "aggregates", "improvement", "sample_efficiency", "learning_curves", "symmetry_losses"}
-    names |= {"loss_components_eqr_rainbow"}  # drawn for two loss combinations, but not for a single group
-    data = {"report.html", "table.md", "table.tex", "scores.csv", "scores.parquet", "aggregates.csv"}
+    names = {"profiles", "aggregates", "sample_efficiency", "learning_curves"}
+    data = {"report.html", "table.md", "aggregates.csv"}
     assert {path.name for path in drawn.parent.iterdir()} == data | {f"{name}.png" for name in names}
     for path in drawn.parent.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG") and path.read_bytes().endswith(b"IEND\xaeB`\x82")
-    scores = pd.read_csv(report.with_name("scores.csv"))
-    assert len(scores) == 27 * (2 + 1 + 2 + 1) and set(scores["kind"]) == {"curve", "final", "training"}
-    pd.testing.assert_frame_equal(scores, pd.read_parquet(report.with_name("scores.parquet")))
 
 
 def test_the_page_is_self_contained(drawn):
@@ -265,9 +260,8 @@ def test_a_different_protocol_raises_or_is_marked(tmp_path, not_drawn):
     page = write_report([folder], {}, True, tmp_path / "report", reps=5)
     text = text_of(page)
     assert f"‡ {BASE} was run under another protocol: steps is 50000, not 100000" in text
-    assert text.count(f">{BASE} ‡</t") >= 4 and f"{FULL} ‡" not in text  # summary, games, runs, settings
+    assert text.count(f">{BASE} ‡</t") >= 3 and f"{FULL} ‡" not in text  # games, runs, settings
     assert "se2+aet ‡ |" in page.with_name("table.md").read_text()
-    assert r"se2+aet \ddag{} &" in page.with_name("table.tex").read_text()
     rows = pd.read_csv(page.with_name("aggregates.csv")).dropna(subset="protocol_differs")
     assert set(rows["agent"]) == {BASE} and rows["protocol_differs"].str.startswith("steps is 50000").all()
 
@@ -313,9 +307,7 @@ def test_nothing_to_compare(tmp_path):
 
 
 def test_games_without_bounds_and_runs_in_two_folders(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"Boxng has no bounds for normalisation .* Pong, Boxing, Krull\. Did you mean 'Boxing'\?"
-    ):
+    with pytest.raises(ValueError, match=r"Boxng has no bounds for normalisation .* Pong, Boxing, Krull\. Correct the name"):
         compare([a_benchmark(tmp_path / "a", {"dqn": {"Pong": [1.0]}}, change=lambda r: r | {"game": "Boxng"})], {}, False)
 
     one = {"dqn": {"Pong": [1.0]}}
@@ -422,19 +414,9 @@ def test_one_agent_one_game_one_seed(tmp_path, not_drawn):
     assert rows.at["IQM", "value"] == pytest.approx(20.7 / 35.3) and rows[["low", "high"]].isna().all(axis=None)
     assert "<b>" not in text
     found = all_figures(analyse(compare([folder], {}, True), 5))
-    assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves", "symmetry_losses"]
+    assert [p.name for p in found] == ["profiles", "aggregates", "sample_efficiency", "learning_curves"]
     assert "95%" not in "".join(p.caption for p in found)
     assert found[-1].caption.endswith("A single run each.")
-
-
-def test_without_pyarrow_the_parquet_file_is_skipped(tmp_path, not_drawn, monkeypatch):
-    def missing(self, *args, **kwargs):
-        raise ImportError("pyarrow")
-
-    monkeypatch.setattr(pd.DataFrame, "to_parquet", missing)
-    page = write_report([a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]})], {}, False, tmp_path / "report", reps=5)
-    assert "scores.parquet was left out: it needs pyarrow" in text_of(page)
-    assert not page.with_name("scores.parquet").exists() and page.with_name("scores.csv").exists()
 
 
 def test_other_units_have_no_published_scores(tmp_path, not_drawn):
@@ -445,14 +427,14 @@ def test_other_units_have_no_published_scores(tmp_path, not_drawn):
 
 def test_a_reference_with_runs_has_intervals(tmp_path, not_drawn):
     file = tmp_path / "theirs.json"
-    file.write_text(json.dumps({"pong": [0.0, 1.0], "BOXING": [5.0, 6.0], "kr_ull": [2000, 2100], "Hero": [1.0]}))
+    theirs = {"pong": [0.0, 1.0, 0.5], "BOXING": [5.0, 6.0, 5.5], "kr_ull": [2000, 2100, 2050], "Hero": [1.0] * 3}
+    file.write_text(json.dumps(theirs))
     page = write_report([a_benchmark(tmp_path / "a")], {"THEIRS": file}, False, tmp_path / "report", reps=20)
     rows = pd.read_csv(page.with_name("aggregates.csv")).query("agent == 'THEIRS'").set_index("metric")
-    scores = matrix("T", {"T": {"Pong": [0.0, 1.0], "Boxing": [5.0, 6.0], "Krull": [2000, 2100]}})
-    assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 2
+    scores = matrix("T", {"T": dict(zip(("Pong", "Boxing", "Krull"), theirs.values(), strict=False))})
+    assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 3
     assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
-    assert "THEIRS: first 2 runs only, as many as Krull has" not in text_of(page)
-    assert "THEIRS is better than dqn" in text_of(page) and "2 and 3 runs on 3 games" in text_of(page)
+    assert "THEIRS is better than dqn" in text_of(page) and "; 3 runs on 3 games" in text_of(page)
     with pytest.raises(ValueError, match="--reference must have a name that no agent has, got 'dqn'"):
         compare([tmp_path / "a"], {"dqn": file}, False)
 
@@ -470,8 +452,6 @@ def test_curves_are_over_fractions_of_the_steps_and_end_with_the_final_evaluatio
     assert fractions.tolist() == [0.5, 1.0] and curves.shape == (3, 3, 2)
     assert curves[..., -1] == pytest.approx(matrix(FULL))
     assert curves[0, 0, 0] == pytest.approx((-4.5 + 20.7) / 35.3)  # Pong, seed 0, half way
-    losses = symmetry_losses(comparison).query("game == 'Pong'")
-    assert losses["step"].tolist() == [5, 10] * 3 and (losses["value"] == 0.75).all()  # thousands: ends of twentieths
 
 
 def test_curves_of_many_points_and_of_points_that_coincide(tmp_path):
@@ -490,31 +470,12 @@ def test_curves_of_many_points_and_of_points_that_coincide(tmp_path):
     assert curves.shape == (3, 3, 200) and curves[..., -1] == pytest.approx(matrix(FULL))
 
 
-def test_losses_between_those_logged_are_interpolated(tmp_path):
-    """Twentieths of 100,000 steps: seed 0 logs in the first and third, the other seeds from the second to the fourth."""
-
-    def change(result):
-        logged = {4_000: 1.0, 14_000: 3.0} if result["seed"] == 0 else {8_000: 5.0, 18_000: 7.0}
-        return result | {"losses": [{"step": step, "aet_loss": loss} for step, loss in logged.items()]}
-
-    folder = a_benchmark(tmp_path / "a", {FULL: SCORES[FULL]}, change=change)
-    found = symmetry_losses(compare([folder], {}, False)).query("game == 'Pong'").groupby("seed")
-    assert found["step"].apply(list).tolist() == [[10, 15]] * 3
-    assert found["value"].apply(list).tolist() == [[2, 3], [5, 6], [5, 6]]
-
-
 def test_empty_figures_are_omitted(tmp_path):
     def change(result):
         return result | {"losses": [], "evaluations": result["evaluations"][-1:]}
 
     found = all_figures(analyse(compare([a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]}, change=change)], {}, False), 5))
     assert [shown.name for shown in found] == ["profiles", "aggregates"]
-
-
-def test_ablations_of_groups_have_a_figure(tmp_path):
-    scores = {"eqr_qrdqn:mlp+aet+r": SCORES["dqn"], "eqr_qrdqn:gl2+aet+r": SCORES[FULL], FULL: SCORES[FULL]}
-    found = {p.name for p in all_figures(analyse(compare([a_benchmark(tmp_path / "a", scores)], {}, False), 5))}
-    assert "groups_eqr_qrdqn" in found and not {"groups_eqr_rainbow", "loss_components_eqr_rainbow"} & found
 
 
 def test_agents_can_be_told_apart_without_colours():
@@ -526,8 +487,6 @@ def test_cells_are_escaped():
     table = make_table(["a_b", "50% & more"], [["x|y", "1\n± 2"], ["<z>", "3"]], [[False, True], [False, False]])
     lines = [re.sub(" +", " ", line) for line in to_markdown(table).splitlines()]
     assert lines[0] == "| a_b | 50% & more |" and lines[2] == r"| x\|y | **1** ± 2 |"
-    latex = to_latex(table)
-    assert r"a\_b & 50\% \& more \\" in latex and r"x|y & \bfseries 1 $\pm$ 2 \\" in latex
     assert "&lt;z&gt;" in to_html(table) and "<z>" not in to_html(table) and "<b>1</b><br><small>± 2</small>" in to_html(table)
 
 
@@ -542,3 +501,69 @@ def test_numbers(value, decimals, text):
 def test_published_means_use_the_names_of_the_suite():
     means = published_means(SHOWN, ["Bank_Heist", "Tetris", "Pong"])
     assert means.index.tolist() == ["Bank_Heist", "Pong"] and means.at["Pong", "EqR, R (paper)"] == -6.0
+
+
+def test_two_runs_have_no_verdict(tmp_path, not_drawn):
+    """However far apart they are."""
+    scores = {"dqn": {"Pong": [-20.0, -19.9]}, FULL: {"Pong": [20.0, 19.9]}}
+    page = write_report([a_benchmark(tmp_path / "a", scores)], {}, True, tmp_path / "report", reps=20)
+    text = text_of(page)
+    assert "2 runs per game do not show how much of that is chance" in text and "is better than dqn" not in text
+    assert "<b>" not in text
+
+
+def test_raw_scores_have_no_gap_and_no_bounds(tmp_path, not_drawn):
+    suite = make_suite("own", "test", {key: value for key, value in ENTRY.items() if key != "normalisation"})
+    page = write_report([a_benchmark(tmp_path / "a", suite=suite)], {}, False, tmp_path / "report", reps=5)
+    for text in (text_of(page), page.with_name("table.md").read_text(), page.with_name("aggregates.csv").read_text()):
+        assert not re.search("optimality gap|score 0|score 1|games above|normalised scores", text), text
+    assert [shown.name for shown in all_figures(analyse(compare([tmp_path / "a"], {}, False), 5))][1] == "aggregates"
+
+
+def test_the_baseline_is_the_same_agent_without_eqr_where_no_stock_agent_ran(tmp_path):
+    def change(result):
+        result["entry"] |= {
+            "algo": "eqr_rainbow",
+            "hyperparameters": {"prediction_depth": 5 if result["agent"] == BASE else 0},
+        }
+        return result
+
+    scores = {BASE: SCORES[BASE], "eqr_rainbow:zero": SCORES[FULL]}
+    assert compare([a_benchmark(tmp_path / "a", scores, change=change)], {}, False).agents == ["eqr_rainbow:zero", BASE]
+
+
+def test_differences_per_game_have_welch_intervals(tmp_path, not_drawn):
+    """Means 4 and 1, variances 4 and 1, three seeds each: s² = 5/3, (5/3)² / ((4/3)² / 2 + (1/3)² / 2) degrees of freedom."""
+    scores = {"dqn": {"Pong": [0.0, 1.0, 2.0]}, FULL: {"Pong": [2.0, 4.0, 6.0]}}
+    half = t.ppf(0.975, (25 / 9) / (16 / 18 + 1 / 18)) * (5 / 3) ** 0.5
+    found = difference_table(compare([a_benchmark(tmp_path / "a", scores)], {}, True)).cells
+    assert found.to_numpy().tolist() == [["Pong", f"3.00\n[{number(3 - half)}, {number(3 + half)}]"]]
+    assert half == pytest.approx(4.15, abs=0.1)  # t is 3.18 for 3 degrees of freedom
+
+
+def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
+    """In two parts, of which the second replaces a run, without what was stopped and the machine's folders."""
+    file = tmp_path / "all.jsonl.xz"
+
+    def change(result):
+        command = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml".replace("TOP", "/a/b-1")
+        return result | {"command": command} | ({"stopped_at": 7} if result["seed"] == 2 else {})
+
+    first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]}, change=change)
+    assert pack(first, file) == 9
+    both = a_benchmark(tmp_path / "b", {"dqn": {"Pong": [7.0, 8.0]}, FULL: SCORES[FULL]}, change=change)
+    assert pack(both, file) == 18
+    found = compare([file], {}, False)
+    assert found.games == SUITE.games and found.agents == ["dqn", FULL] and found.bounds["Pong"] == tuple(PONG)
+    assert found.notes[0] == "6 runs were stopped before their end and are left out."
+    raw = {key: rows["raw"].tolist() for key, rows in found.scores.groupby(["agent", "game"])}
+    assert raw["dqn", "Pong"] == [7.0, 8.0] and raw["dqn", "Krull"] == [1598.0, 1798.0]
+    assert found.results[0]["command"] == "run here --agents dqn:a.yml dqn:settings/b.yml"
+    assert len(load_scores(file)) == 12 * 6
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match="must be a file of sb3-eqr benchmark pack, got another or a damaged one"):
+        compare([file], {}, False)
+    for damaged in ("{", "[]", "[1]", "{}", "3"):
+        next(both.glob("runs/*/*/*/result.json")).write_text(damaged)
+        with pytest.raises(ValueError, match=r"result.json must be the result of a run, got a damaged file"):
+            compare([both], {}, False)

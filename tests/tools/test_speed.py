@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch as th
 
-from benchmarks import speed, workload
-from benchmarks.clock import Series, Table, count_operations, take_turns
-from benchmarks.sizes import growth
-from benchmarks.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, bytes_per_transition, fill, make_agent
+from experiments import speed, workload
+from experiments.clock import Series, Table, count_operations, take_turns
+from experiments.sizes import growth
+from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, bytes_per_transition, fill, make_agent
 from sb3_eqr import EqRQRDQN
 from tests.tools.test_package import ROOT
 
@@ -102,7 +102,7 @@ def test_options():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, sizes, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, graph, sizes, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
         ("--largest 100", "--largest must be an integer >= 10000, got 100"),
@@ -135,7 +135,7 @@ def test_importing_another_version_together_with_this_one(monkeypatch):
 @pytest.mark.slow
 def test_script_prints_its_tables(tmp_path):
     parts = ["--only", "updates,neighbour,steps,profile", "--network", "minatar", "--before", str(ROOT)]
-    command = [sys.executable, "-m", "benchmarks.speed", "--threads", "1", "--rounds", "1", *parts]
+    command = [sys.executable, "-m", "experiments.speed", "--threads", "1", "--rounds", "1", *parts]
     done = subprocess.run([*command, "--json", tmp_path / "speed.json"], check=True, capture_output=True, text=True, cwd=ROOT)
     found = json.loads((tmp_path / "speed.json").read_text())
     assert {"command", "threads", "versions"} <= found.keys() and done.stdout.startswith(found["cpu"])

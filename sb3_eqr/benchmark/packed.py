@@ -1,0 +1,78 @@
+"""
+Finished runs as one compressed file, ``NAME.jsonl.xz``: the suite in the first line, then a line per run. ``report`` reads
+such a file like the folder of a benchmark.
+"""
+
+import json
+import lzma
+import pathlib
+import re
+from typing import Any
+
+from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
+from sb3_eqr.benchmark.suites import Suite, merge, read_suite
+from sb3_eqr.common.saving.files import atomic_write
+
+SUFFIX = ".jsonl.xz"
+NEEDED = ("agent", "game", "seed", "protocol", "entry", "evaluations", "training", "losses")  # in every row
+ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
+
+
+def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
+    """
+    :param path: folder of a benchmark, or a file of :func:`pack`
+    :return: its suite, and a row per run that has finished or was stopped; the latter have "stopped_at", a step
+    :raises ValueError: if the path is neither
+    """
+    if path.is_file():
+        try:
+            with lzma.open(path, "rt", encoding="utf-8") as lines:
+                first, *rows = [json.loads(line) for line in lines]
+            return Suite.model_validate(first["suite"]), rows
+        except (lzma.LZMAError, EOFError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{path} must be a file of sb3-eqr benchmark pack, got another or a damaged one ({error})."
+            ) from error
+    if not (path / SUITE).is_file():
+        found = "one without suite.yml" if path.is_dir() else "no folder"
+        raise ValueError(f"{path} must be a folder of sb3-eqr benchmark run, got {found}. Run sb3-eqr benchmark run first.")
+    files = {file.parent: file for name in (STOPPED, RESULT) for file in path.glob(f"runs/*/*/*/{name}")}
+    return read_suite(path / SUITE), [_read_row(files[folder]) for folder in sorted(files)]
+
+
+def _read_row(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        row = dict(json.loads(path.read_text(encoding="utf-8")))
+        if missing := [key for key in NEEDED if key not in row]:
+            raise ValueError(f"without {', '.join(missing)}")
+        return row
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"{path} must be the result of a run, got a damaged file ({error}). Remove it and run it again."
+        ) from error
+
+
+def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
+    """
+    Keeps only the last part of absolute paths, since the folders above it are those of one machine.
+
+    :param folder: folder of a benchmark
+    :param file: the file, to which runs are added; those that it has of the same agent, game and seed are replaced
+    :return: number of runs in the file
+    """
+    if not file.name.endswith(SUFFIX):
+        raise ValueError(f"FILE must end with {SUFFIX}, got {file}.")
+    suite, rows = read(folder)
+    if file.is_file():
+        old, kept = read(file)
+        suite, rows = merge(old, suite), [*kept, *rows]
+    by_run = {(row["agent"], row["game"], row["seed"]): row for row in rows}
+    write(file, suite, [by_run[run] for run in sorted(by_run)])
+    return len(by_run)
+
+
+def write(file: pathlib.Path, suite: Suite, rows: list[dict[str, Any]]) -> None:
+    """Write a suite and its runs."""
+    lines = [ABSOLUTE.sub("", json.dumps(line)) + "\n" for line in ({"suite": suite.model_dump()}, *rows)]
+    with atomic_write(file, "file") as out:
+        out.write(lzma.compress("".join(lines).encode()))
