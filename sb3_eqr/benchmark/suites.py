@@ -11,8 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, Val
 
 from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
+from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.files import atomic_write
-from sb3_eqr.zoo.checks import SIMILAR, nearest
+from sb3_eqr.zoo.checks import SIMILAR
 
 RAW = "raw score"  # the unit of scores that are not normalised
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")

@@ -1,6 +1,5 @@
 """The Atari-100K protocol of the paper (§7 and Table 5), built from SB3's and gymnasium's wrappers."""
 
-import difflib
 import re
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +10,8 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.atari_wrappers import ClipRewardEnv, EpisodicLifeEnv, MaxAndSkipEnv, NoopResetEnv, WarpFrame
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
+
+from sb3_eqr.common.checks.arguments import nearest
 
 NOOP_MAX = 30  # §7, as in SPR: at most 30 no-ops at the start of a game
 FRAME_SKIP = 4  # Table 5, action repetitions
@@ -116,7 +117,6 @@ def atari_env_id(game: str) -> str:
     games = {name[4:-3].lower(): name for name in gym.registry if re.fullmatch(r"ALE/[A-Za-z]+[A-Za-z0-9]*-v5", name)}
     bare = re.sub(r"^ALE/|-v5$|NoFrameskip-v4$|[_ ]", "", game)
     if bare.lower() not in games:
-        near = difflib.get_close_matches(bare.lower(), games, n=3)
-        hint = f"Did you mean {', '.join(games[name][4:-3] for name in near)}?" if near else "See gymnasium.registry."
-        raise ValueError(f"game must be the name of an Atari game such as 'Pong', got {game!r}. {hint}")
+        hint = nearest(bare, [name[4:-3] for name in games.values()]) or " See gymnasium.registry."
+        raise ValueError(f"game must be the name of an Atari game such as 'Pong', got {game!r}.{hint}")
     return games[bare.lower()]

@@ -11,11 +11,12 @@ import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import StoreDict, get_model_path
 
+from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.checkpoints import read_manifest
 from sb3_eqr.common.saving.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail, nearest
+from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 from sb3_eqr.zoo.registration import trust_files
 

@@ -1,16 +1,15 @@
 """Checks of the command line before RL Zoo starts, with messages that say what to do."""
 
-import difflib
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Iterable
 from typing import NoReturn
 
 import gymnasium as gym
 import torch as th
 from rl_zoo3.utils import ALGOS
 
+from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.envs import import_packages
 
 # Prefix of an environment's name -> package that it needs, and how to install it.
@@ -21,15 +20,6 @@ EXTRAS = {
 
 
 SIMILAR = 0.8  # for names of environments: "-v0" alone makes any two alike
-
-
-def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
-    """
-    :param cutoff: least similarity, in [0, 1]
-    :return: the end of a message: a question with the closest legal name, or ""
-    """
-    found = difflib.get_close_matches(name, list(legal), n=1, cutoff=cutoff)
-    return f" Did you mean {found[0]!r}?" if found else ""
 
 
 def fail(message: str) -> NoReturn:

@@ -13,12 +13,12 @@ from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, number
+from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, nearest, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.trust import wrapper_names
-from sb3_eqr.zoo.checks import fail, nearest
+from sb3_eqr.zoo.checks import fail
 
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}

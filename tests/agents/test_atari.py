@@ -28,7 +28,7 @@ def test_all_names_of_a_game(game):
 def test_names_of_two_words_and_unknown_games():
     assert atari.atari_env_id("MsPacman") == atari.atari_env_id("ms_pacman") == atari.atari_env_id("Ms Pacman")
     assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
-    with pytest.raises(ValueError, match="Did you mean Pong"):
+    with pytest.raises(ValueError, match="Did you mean 'Pong'"):
         make_atari100k_env("Pnog")
     for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # a different protocol
         with pytest.raises(ValueError, match="Atari game such as 'Pong', got 'Pong"):

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 import sb3_eqr
 from experiments import installation
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
+from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.envs import make_atari100k_env
 
@@ -67,7 +68,9 @@ def test_every_argument_is_documented(algorithm):
     """help() has the arguments of the agent and of its policy, each once."""
     policy = algorithm.policy_aliases["MlpPolicy"]
     for callables in ([algorithm.__init__], [policy.__init__, EqRPolicy.__init__]):
-        text = "".join((function.__doc__ or "") for function in callables) + "".join(c.__doc__ for c in (policy, EqRPolicy))
+        text = "".join((function.__doc__ or "") for function in callables) + "".join(
+            c.__doc__ for c in (policy, EqRPolicy, LatentOptions)
+        )
         names = {name for function in callables for name in inspect.signature(function).parameters}
         for name in names - {"self", "kwargs"}:
             assert f":param {name}:" in text, name

@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, fields
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -189,6 +190,15 @@ def check_fields(options: Any, prefix: str = "") -> None:
     :raises ValueError: for the first field with an illegal value
     """
     check_arguments(vars(options), rules_of(options), prefix)
+
+
+def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
+    """
+    :param cutoff: least similarity, in [0, 1]
+    :return: the end of a message: a question with the closest legal name, or ""
+    """
+    found = get_close_matches(name, list(legal), n=1, cutoff=cutoff)
+    return f" Did you mean {found[0]!r}?" if found else ""
 
 
 def check(name: str, value: Any, rule: Rule) -> None:

@@ -6,7 +6,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
 from functools import wraps
 from typing import Any, ParamSpec
 
@@ -16,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr.common.checks.arguments import POLICY
+from sb3_eqr.common.checks.arguments import POLICY, nearest
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
@@ -91,10 +90,10 @@ def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewh
         if name not in legal:
             places = [place for place, taker in elsewhere.items() if name in inspect.signature(taker).parameters]
             places += ["policy_kwargs"] if "policy_kwargs" in elsewhere and name in POLICY else []  # maybe of the other agent
-            near = ["symmetry_coef"] if name == "get_coef" else get_close_matches(name, legal, n=1)
-            advice = f"It takes {', '.join(one for one in legal if not one.startswith('_'))}."
-            advice = f"Pass {places[0]}=dict({name}=...)." if places else f"Did you mean {near[0]!r}?" if near else advice
-            raise TypeError(f"{owner} got an unexpected argument {name!r}. {advice}")
+            near = " Did you mean 'symmetry_coef'?" if name == "get_coef" else nearest(name, legal)
+            advice = near or f" It takes {', '.join(one for one in legal if not one.startswith('_'))}."
+            advice = f" Pass {places[0]}=dict({name}=...)." if places else advice
+            raise TypeError(f"{owner} got an unexpected argument {name!r}.{advice}")
 
 
 def answers_misspelt(**elsewhere: type) -> Callable[[Callable[P, None]], Callable[P, None]]:
