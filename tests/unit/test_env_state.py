@@ -228,3 +228,30 @@ def test_a_different_environment_raises():
     state, _ = capture(second)
     with pytest.raises(ValueError, match="must be an object, got nothing: the environment is not built as"):
         restore(first, state)
+
+
+def attributes(number, **children):
+    return {":kind:": "attributes", ":number:": number, **children}
+
+
+@pytest.mark.parametrize("name", ["step", "render", "__class__", "__dict__", "spec", "unwrapped", "helper", "library"])
+def test_a_file_reaches_no_method_function_or_module(name):
+    """From any of them a file could reach ``os.system``; what is named like them is not replaced either."""
+    env = ChainEnv()
+    env.helper, env.library = np.zeros, json
+    before = dict(vars(env))
+    for child in (attributes(1, __globals__={":kind:": "dict", ":class:": "dict"}), {":kind:": "plain", "value": 1}):
+        with pytest.raises(ValueError, match=rf"ChainEnv\.{name} must be state of an environment, got a method"):
+            restore(env, attributes(0, **{name: child}))
+    assert vars(env).keys() == before.keys() and all(vars(env)[key] is value for key, value in before.items())
+
+
+def test_bytes_of_an_emulator_are_restored_into_an_emulator_only():
+    class Trap:
+        def cloneSystemState(self):
+            raise AssertionError("was run")
+
+    env = ChainEnv()
+    env.trap = Trap()
+    with pytest.raises(ValueError, match=r"ChainEnv\.trap must be an emulator of ale-py, got Trap"):
+        restore(env, attributes(0, trap={":kind:": "emulator", "value": "00"}))

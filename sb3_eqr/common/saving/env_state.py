@@ -5,6 +5,7 @@ arrays and containers, but no other objects, and executes no code of the file. W
 
 import enum
 import functools
+import inspect
 import io
 import logging
 import random
@@ -143,6 +144,22 @@ class _Capture:
         return {KIND: "attributes", **named, **found}
 
 
+def _own_value(current: Any, name: str, path: str, state: Any) -> Any:
+    """
+    The value of an attribute that a file names. Only what the object itself holds is looked up: from its methods, a file could
+    reach every module of the process. Nothing that would shadow a method or a property is restored.
+
+    :raises ValueError: if the file names anything else
+    """
+    of_class = inspect.getattr_static(type(current), name, None)
+    is_defined = callable(of_class) or hasattr(of_class, "__get__")
+    found = vars(current).get(name, None if is_defined else of_class)
+    shadows = name not in vars(current) and is_defined
+    if name in SKIPPED or (name.startswith("__") and name.endswith("__")) or shadows or (isinstance(found, FIXED) and state):
+        raise ValueError(f"{path} must be state of an environment, got a method, a function or a module. Nothing was run.")
+    return found
+
+
 def _is_plain_key(key: Any) -> bool:
     return key is None or type(key) in (bool, int, float, str) or (type(key) is tuple and all(map(_is_plain_key, key)))
 
@@ -173,7 +190,7 @@ class _Restoring:
 
     def _claimed(self, current: Any, path: str) -> Any:
         """An object to update, which must not be one that was already updated with the state of another object."""
-        if current is None or id(current) in self._updated:
+        if current is None or isinstance(current, FIXED) or id(current) in self._updated:
             raise MissingObjectError(path)
         self._updated[id(current)] = current
         return current
@@ -225,6 +242,8 @@ class _Restoring:
         return current
 
     def _emulator(self, current: Any, state: Any, path: str) -> Any:
+        if type(current).__name__ != "ALEInterface" or not type(current).__module__.startswith("ale_py"):
+            raise ValueError(f"{path} must be an emulator of ale-py, got {type(current).__name__}. Nothing was run.")
         kind = type(self._claimed(current, path).cloneSystemState())
         current.restoreSystemState(kind(bytes.fromhex(state["value"])))
         return current
@@ -240,9 +259,10 @@ class _Restoring:
             )
         self._objects[state[NUMBER]] = self._claimed(current, path)  # its attributes may refer to it
         for name, child in state.items():
-            if name not in (KIND, CLASS, NUMBER):
-                old = getattr(current, name, None)
-                vars(current)[name] = self.restored(old, child, f"{path}.{name}")  # some objects refuse setattr
+            if name in (KIND, CLASS, NUMBER) or (child is None and name not in vars(current)):
+                continue
+            old = _own_value(current, name, f"{path}.{name}", child)
+            vars(current)[name] = self.restored(old, child, f"{path}.{name}")  # some objects refuse setattr
         return current
 
     def _list(self, current: Any, state: Any, path: str) -> Any:
@@ -259,7 +279,7 @@ class _Restoring:
             return UNCHANGING[name](found)
         if name == "deque":
             return deque(found, state["maxlen"])
-        if type(current).__name__ != name:
+        if type(current).__name__ != name or not isinstance(current, tuple) or not hasattr(current, "_fields"):
             raise MissingObjectError(path)
         return type(current)(*found)  # a named tuple
 
