@@ -470,8 +470,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution. After an error,
-        all parameters are as before.
+        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution, or if the moments
+        of the optimiser do not fit its parameters. After an error, all parameters are as before.
         """
         if not isinstance(load_path_or_dict, dict):
             saved = read_data(load_path_or_dict).get("policy_description", {})
@@ -480,6 +480,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         before: Any = copy.deepcopy(self.get_parameters())
         try:
             super().set_parameters(load_path_or_dict, exact_match, device)
+            validation.check_moments(self.policy.optimizer)
         except Exception:
             super().set_parameters(before)  # PyTorch copies the tensors that fit before it raises
             raise

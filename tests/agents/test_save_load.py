@@ -21,6 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
+from sb3_eqr.common.saving.files import seal
 from tests.models import EITHER, MAKERS, loss_terms
 from tests.resume import Save, make_env
 from tests.toys import ChainEnv, DictEnv, ImageEnv
@@ -456,3 +457,56 @@ def test_a_save_that_fails_leaves_the_old_file(make, tmp_path, monkeypatch):
         with pytest.raises(OSError, match="No space"):
             save(tmp_path / ("model" if save == model.save else "buffer"))
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+def rewritten(path, **changes):
+    """Change attributes in a saved file, and seal it again, as an attacker can."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    parts["data"] = json.dumps({**json.loads(parts["data"]), **changes}).encode()
+    with open(path, "wb+") as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, content in parts.items():
+                archive.writestr(name, content)
+        seal(file)
+
+
+@EITHER
+@pytest.mark.parametrize("as_object", [False, True])
+def test_a_file_cannot_name_an_environment_to_make(make, as_object, tmp_path):
+    """``gym.make`` imports the module in "module:Name-v0"."""
+    make(ChainEnv()).save(tmp_path / "model")
+    rewritten(tmp_path / "model.zip", env="antigravity:CartPole-v1")
+    if as_object:
+        with open(tmp_path / "model.zip", "rb") as file:
+            loaded = make.algorithm.load(file)
+    else:
+        loaded = make.algorithm.load(tmp_path / "model")
+    assert loaded.env is None and "antigravity" not in sys.modules
+
+
+@EITHER
+@pytest.mark.parametrize("ending", ["", ".zip", "/", "//"])
+def test_every_way_to_write_a_path_is_checked(make, ending, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make(ChainEnv()).save("model")
+    for start in ("", "./", f"{tmp_path}/"):
+        assert make.algorithm.load(f"{start}model{ending}").seed == 0
+    content = pathlib.Path("model.zip").read_bytes()
+    pathlib.Path("model.zip").write_bytes(content[:-3000])
+    with pytest.raises(ValueError, match="must be a complete file"):
+        make.algorithm.load(f"./model{ending}")
+
+
+@EITHER
+def test_moments_of_another_shape_are_refused(make):
+    """SB3 loads them, and fused Adam then writes beyond their memory."""
+    model = make(ChainEnv()).learn(46)
+    parameters = deepcopy(model.get_parameters())
+    first = parameters["policy.optimizer"]["state"][0]
+    first["exp_avg"] = first["exp_avg"].flatten()[:1].clone()
+    before = [p.clone() for p in model.policy.parameters()]
+    with pytest.raises(ValueError, match=r"exp_avg of the optimiser must have the shape of its parameter, .*, got \(1,\)"):
+        model.set_parameters(parameters)
+    assert all(th.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
+    model.learn(4, reset_num_timesteps=False)

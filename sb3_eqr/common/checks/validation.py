@@ -266,3 +266,16 @@ def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> No
                 f"{name}: parameters must be for {expected[name]!r}, got parameters for {found[name]!r}. "
                 "Build the model with the policy_kwargs and observations of the file, or use load(), which does so."
             )
+
+
+def check_moments(optimizer: th.optim.Optimizer) -> None:
+    """Raise ValueError if a loaded moment has not the shape and kind of its parameter: fused Adam would write beyond it."""
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if not isinstance(value, th.Tensor) or value.ndim == 0:
+                continue
+            if value.shape != parameter.shape or value.is_floating_point() != parameter.is_floating_point():
+                raise ValueError(
+                    f"{name} of the optimiser must have the shape of its parameter, {tuple(parameter.shape)}, got "
+                    f"{tuple(value.shape)}, {value.dtype}. Load a file that was saved by the same kind of agent."
+                )

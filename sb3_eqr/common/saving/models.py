@@ -35,14 +35,15 @@ from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 
 
-def is_whole_model(path: pathlib.Path) -> bool:
+def is_whole_model(source: pathlib.Path | bytes) -> bool:
     """
-    :param path: an existing file
+    :param source: an existing file, or its content
     :return: whether it is an unchanged zip file with everything that SB3's ``save`` writes. The components of a model are zip
         files themselves, so a truncated file may still look like a zip file.
     """
     try:
-        with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+        opened: Any = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")
+        with opened as file, zipfile.ZipFile(file) as archive:
             is_model = {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
             return is_model and is_unbroken(file) and archive.testzip() is None
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # from damaged headers
@@ -92,15 +93,16 @@ def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
 
 def refuse_folder(path: Any) -> None:
     """Raise ValueError if the path is a folder instead of a file."""
-    if isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).is_dir():
-        if not any(pathlib.Path(f"{path}.{suffix}").is_file() for suffix in ("zip", "pkl")):
+    if isinstance(path, (str, pathlib.Path)) and (place := pathlib.Path(path)).is_dir():
+        if not any(place.with_name(f"{place.name}.{suffix}").is_file() for suffix in ("zip", "pkl")):
             raise ValueError(f"{path} must be a file, got a folder. Use resume for a folder of checkpoints.")
 
 
 def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
     """Find a model's file; the path may omit the extension. Raises ValueError for a folder."""
     refuse_folder(path)
-    return next((p for p in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if p.is_file()), None)
+    place = pathlib.Path(path)
+    return next((p for p in (place, place.with_name(f"{place.name}.zip")) if p.is_file()), None)
 
 
 class SafeFiles(OffPolicyAlgorithm):
@@ -172,15 +174,17 @@ class SafeFiles(OffPolicyAlgorithm):
             kwargs,
             [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:],
         )
-        if isinstance(path, (str, pathlib.Path)):
-            found = find_file(path)
-            if found is not None and not is_whole_model(found):
+        source: Any = path
+        if isinstance(path, (str, pathlib.Path)) and (found := find_file(path)) is not None:
+            content = found.read_bytes()  # once, so that what is loaded is what was checked
+            if not is_whole_model(content):
                 raise ValueError(
                     f"{found} must be a complete file written by {cls.__name__}.save, got a truncated or damaged file, or "
                     "another kind of file. Load an earlier checkpoint."
                 )
-        given = custom_objects or {}
-        data = {name: value for name, value in read_data(path).items() if name not in given}
+            source = io.BytesIO(content)
+        given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
+        data = {name: value for name, value in read_data(source).items() if name not in given}
         saved = data.get("policy_class") or {}
         module = str(saved.get("module", saved.get("__module__", ""))) if isinstance(saved, dict) else ""
         if module.startswith(("stable_baselines3.", "sb3_contrib.")):
@@ -189,7 +193,7 @@ class SafeFiles(OffPolicyAlgorithm):
                 "Load it with the class that saved it."
             )
         objects = {**decode_data(path, data, trust), **given}  # instead of SB3's unpickling
-        model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
+        model = super().load(source, env, device, objects, print_system_info, force_reset, **kwargs)
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
         if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
