@@ -1,7 +1,6 @@
 import pytest
 import torch as th
 
-from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from tests.models import MAKERS
 
 th.set_num_threads(1)  # small networks are slower on two threads, and xdist runs two tests at once
@@ -19,9 +18,3 @@ def no_gpu(request, monkeypatch):
 def make(request):
     """A maker of small agents, of each algorithm in turn."""
     return request.param
-
-
-@pytest.fixture
-def backup_each_round(monkeypatch):
-    """Back up at the start of every round, so that a model is restored to it."""
-    monkeypatch.setattr(UpdateMonitor, "INTERVAL", 0)

@@ -29,7 +29,7 @@ class Save(BaseCallback):
             self.model.save(self.folder / "model")
             self.model.save_replay_buffer(self.folder / "buffer")
             env = self.model.get_env()
-            (self.folder / "env.pkl").write_bytes(pickle.dumps(env.env_method("get_state")))
+            (self.folder / "env.pkl").write_bytes(pickle.dumps(env.env_method("state_dict")))
             if isinstance(env, VecNormalize):
                 env.save(str(self.folder / "normalize.pkl"))
                 (self.folder / "returns.pkl").write_bytes(pickle.dumps(env.returns))  # SB3 does not save them
@@ -57,7 +57,7 @@ def main(algorithm: str, folder: pathlib.Path, steps: int) -> None:
     )  # the file has a pickled lambda
     model.load_replay_buffer(folder / "buffer")
     for index, state in enumerate(pickle.loads((folder / "env.pkl").read_bytes())):
-        env.env_method("set_state", state, indices=index)
+        env.env_method("load_state_dict", state, indices=index)
     model.learn(steps, reset_num_timesteps=False)
     model.save(folder / "continued")
 

@@ -17,10 +17,10 @@ class ChainEnv(gym.Env):
         self.rng = np.random.default_rng(0)
         self.position, self.time = 0.0, 0
 
-    def get_state(self):
+    def state_dict(self):
         return self.position, self.time, self.rng.bit_generator.state
 
-    def set_state(self, state):
+    def load_state_dict(self, state):
         self.position, self.time, self.rng.bit_generator.state = state
 
     def observe(self):

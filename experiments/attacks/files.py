@@ -4,12 +4,16 @@ import base64
 import contextlib
 import io
 import json
+import os
 import pathlib
 import pickle
 import random
+import resource
 import shutil
 import subprocess
+import sys
 import threading
+import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -24,7 +28,7 @@ from experiments.attacks import Finding
 from experiments.attacks.inputs import make
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.training import load_checkpoint
-from sb3_eqr.common.saving.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.checkpoints import MANIFEST, checksum_of, digest, find_checkpoints
 from sb3_eqr.visualize.loading import load_model, make_env
 
 RAN = pathlib.Path("ran")  # the file that hostile code creates
@@ -79,21 +83,11 @@ def hostile(folder: pathlib.Path) -> Iterator[tuple[str, str, pathlib.Path]]:
     with open(objects, "wb") as file:
         np.savez(file, data=np.array([Runs()], dtype=object))
     yield "an array of objects as buffer", "buffer", objects
-    forged = folder / "forged.pkl"
-    with np.load(folder / "buffer.pkl") as members:
-        found = {name: members[name] for name in members.files}
-    state = json.loads(found.pop("data").tobytes())
-    state["state"]["rewards"] = {":kind:": "pickle", "type": "x", "pickle": text}
-    with open(forged, "wb") as file:
-        np.savez(file, data=np.frombuffer(json.dumps(state).encode(), dtype=np.uint8), **found)
-    yield "a pickle among the buffer's numbers", "buffer", forged
-    for name in ("environment.json", "manifest.json"):
-        copy = folder / f"hostile_{name}"
-        shutil.copytree(find_checkpoints(folder / "checkpoints")[-1], copy)
-        (copy / name).write_text(json.dumps({":kind:": "pickle", "type": "x", "pickle": text}))
-        yield f"a pickle as {name}", "checkpoint", copy
-    copy = folder / "hostile_model"
-    shutil.copytree(find_checkpoints(folder / "checkpoints")[-1], copy)
+    pickle_of = {":kind:": "pickle", "type": "x", "pickle": text}
+    yield from forged_buffers(folder, pickle_of)
+    yield from forged_checkpoints(folder, pickle_of)
+    yield from forged_models(folder, data)
+    copy = copied_checkpoint(folder, "hostile_model")
     repacked(model, copy / "model.zip", {"policy.pth": evil})
     yield "a checkpoint with a hostile model", "checkpoint", copy
     beside = f"!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [{RAN.resolve()}]]"
@@ -108,6 +102,109 @@ def hostile(folder: pathlib.Path) -> Iterator[tuple[str, str, pathlib.Path]]:
         yield f"{name} of RL Zoo", "shown", run / "model.zip"
 
 
+def forged_buffers(folder: pathlib.Path, pickle_of: dict[str, str]) -> Iterator[tuple[str, str, pathlib.Path]]:
+    """Buffers with pickles, with numbers that are out of range, and with sizes that the file does not have."""
+    source = folder / "buffer.pkl"
+    with zipfile.ZipFile(source) as archive:
+        whole = json.loads(archive.read("data"))
+    shape = whole["state"]["rewards"]["shape"]
+    changes: dict[str, Any] = {
+        "a pickle": {"rewards": pickle_of},
+        "a pickle as number": {"pos": pickle_of},
+        "a position": {"pos": 10**9},
+        "a size": {"buffer_size": 10**12},
+        "a shape": {"rewards": {"dtype": "<f4", "shape": [10**12, 1]}},
+        "a dtype": {"rewards": {"dtype": "|O", "shape": shape}},
+        "another number of environments": {"n_envs": 10**6},
+        "a discount": {"gamma": float("nan")},
+    }
+    for name, change in changes.items():
+        changed = json.dumps({**whole, "state": {**whole["state"], **change}}).encode()
+        yield f"{name} in a buffer", "buffer", repacked(source, folder / f"buffer_{name}.pkl", {"data": changed})
+    yield "a compressed buffer", "buffer", bomb(source, folder / "compressed.pkl", "rewards")
+
+
+def bomb(source: pathlib.Path, path: pathlib.Path, member: str) -> pathlib.Path:
+    """Copy a zip file with one member replaced by three gigabytes of zeros, in three megabytes."""
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(path, "w", compresslevel=1) as copy:
+        for name in archive.namelist():
+            if name != member:
+                copy.writestr(name, archive.read(name))
+        info = zipfile.ZipInfo(member)
+        info.compress_type = zipfile.ZIP_DEFLATED
+        with copy.open(info, "w", force_zip64=True) as file:
+            for _ in range(3 << 10):
+                file.write(bytes(1 << 20))
+    return path
+
+
+def copied_checkpoint(folder: pathlib.Path, name: str, **changes: Any) -> pathlib.Path:
+    """Copy the last checkpoint, with other entries of its manifest, whose checksums are right."""
+    copy = folder / name
+    shutil.copytree(find_checkpoints(folder / "checkpoints")[-1], copy)
+    manifest = {**json.loads((copy / MANIFEST).read_text()), **changes}
+    manifest["sha256"] = {path.name: checksum_of(path) for path in sorted(copy.iterdir()) if path.name != MANIFEST}
+    del manifest["digest"]
+    (copy / MANIFEST).write_text(json.dumps({**manifest, "digest": digest(manifest)}))
+    return copy
+
+
+def forged_checkpoints(folder: pathlib.Path, pickle_of: dict[str, str]) -> Iterator[tuple[str, str, pathlib.Path]]:
+    """Checkpoints whose manifest names methods, generators out of range or pickles, and one with a pipe as a file."""
+    whole = json.loads((find_checkpoints(folder / "checkpoints")[-1] / MANIFEST).read_text())
+    walk: dict[str, Any] = {"__globals__": {"sys": {"modules": {"os": {"system": "touch ran"}}}}}
+    for name in ("step", "reset", "render", "__class__", "__dict__", "unwrapped", "spec", "state", "np_random"):
+        for value in (walk, pickle_of, {":kind:": "class", "module": "subprocess", "name": "Popen"}):
+            state = json.loads(json.dumps(whole["environment"]))
+            for layer in state["envs"][0]:
+                layer[1][name] = value
+            copy = copied_checkpoint(folder, f"walk_{name}_{len(json.dumps(value))}", environment=state)
+            yield f"{name} in an environment's state", "checkpoint", copy
+    rng = {
+        **whole["rng"],
+        "numpy": {":kind:": "tuple", "items": ["MT19937", whole["rng"]["numpy"]["items"][1], 10**6, 0, 0.0]},
+    }
+    yield "a generator beyond its array", "checkpoint", copied_checkpoint(folder, "rng", rng=rng)
+    yield "a pickle as generator", "checkpoint", copied_checkpoint(folder, "rng_pickle", rng=pickle_of)
+    deep = copied_checkpoint(folder, "deep")
+    (deep / MANIFEST).write_text('{"a":' * 10**6)
+    yield "deep JSON", "checkpoint", deep
+    pipe = copied_checkpoint(folder, "pipe")
+    (pipe / "model.zip").unlink()
+    os.mkfifo(pipe / "model.zip")
+    yield "a pipe as model", "checkpoint", pipe
+
+
+def forged_models(folder: pathlib.Path, data: dict[str, Any]) -> Iterator[tuple[str, str, pathlib.Path]]:
+    """Models that name an environment to import, describe huge networks, or have moments that do not fit."""
+    model = folder / "model.zip"
+    (folder / "trap_module.py").write_text(f"import pathlib\npathlib.Path({str(RAN.resolve())!r}).touch()\n")
+    sys.path.append(str(folder))
+    kwargs: dict[str, Any] = {
+        "groups": {"group": " x ".join(["SE(2)"] * 100_000)},
+        "a group of many blocks": {"group": "SE(2)^1000000000"},
+        "blocks": {"n_blocks": 10**9},
+        "layers": {"net_arch": [10**5, 10**5]},
+        "a wide latent model": {"latent_hidden_dim": 10**6},
+    }
+    changes = {f"{name} in policy_kwargs": {"policy_kwargs": value} for name, value in kwargs.items()}
+    changes |= {"env": {"env": "trap_module:CartPole-v1"}, "a huge buffer": {"buffer_size": 10**13}}
+    for name, change in changes.items():
+        yield name, "model", repacked(model, folder / f"{name}.zip", {"data": json.dumps({**data, **change}).encode()})
+    deep = ('{"policy_kwargs":' + '{"a":' * 10**6).encode()
+    yield "deep JSON in a model", "model", repacked(model, folder / "deep_data.zip", {"data": deep})
+    for member in ("data", "policy.pth"):
+        yield f"a compressed {member}", "model", bomb(model, folder / f"bomb_{member}.zip", member)
+    with zipfile.ZipFile(model) as archive:
+        optimizer = th.load(io.BytesIO(archive.read("policy.optimizer.pth")), weights_only=True)
+    for shape in ((1,), (0,), (10_000,)):
+        optimizer["state"][0]["exp_avg"] = th.zeros(shape)
+        content = io.BytesIO()
+        th.save(optimizer, content)
+        changed = {"policy.optimizer.pth": content.getvalue()}
+        yield f"moments of shape {shape}", "model", repacked(model, folder / f"moments_{shape}.zip", changed)
+
+
 def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], Any]]]:
     """All functions that load a file, by kind of file."""
     model, env = make(), make_vec_env("CartPole-v1")
@@ -117,6 +214,8 @@ def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], 
             EqRQRDQN.load,
             lambda path: EqRQRDQN.load(path, env=env),
             lambda path: EqRQRDQN.load(open(path, "rb")),
+            lambda path: EqRQRDQN.load(f"{path.with_suffix('')}/"),
+            lambda path: EqRQRDQN.load(f"{path.parent}//{path.stem}"),
             model.set_parameters,
             model.load_representation,
             load_model,
@@ -152,16 +251,48 @@ def strangers_files(folder: pathlib.Path) -> Finding:
     trained(folder)
     ways, wrong, tries, alive = load_paths(folder), [], 0, 0
     files = list(hostile(folder))
+    slowest, before = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for name, kind, path in files:
         for number, load in enumerate(ways[kind]):
             tries += 1
+            began = time.monotonic()
             if runs_code(load, path):
                 wrong.append(f"{name}, way {number}: ran code")
+            seconds = time.monotonic() - began
+            slowest = max(slowest, seconds)
+            if seconds > 10:
+                wrong.append(f"{name}, way {number}: {seconds:.0f} seconds")
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # GB
+    if most > 2:
+        wrong.append(f"{most:.1f} GB, {before / 2**20:.1f} before")
+    tries += 200
+    if swapped(folder, 200):
+        wrong.append("a file that is replaced while it is loaded: ran code")
     for _, kind, path in files:  # with trust=True they must run code, else they would prove nothing
         alive += runs_code(trusting(kind), path)
     test = f"{len(files)} hostile files, {tries} loads"
-    found = f"{len(wrong)} ran code, {alive} with trust"
-    return Finding(test, "0 run code without trust=True", found, not wrong and alive > 0, tuple(wrong))
+    found = f"{len(wrong)} did, {alive} ran code with trust; {slowest:.1f} s, {most:.1f} GB at most"
+    return Finding(test, "0 run code without trust=True, or take 10 s or 2 GB", found, not wrong and alive > 0, tuple(wrong))
+
+
+def swapped(folder: pathlib.Path, times: int) -> bool:
+    """Whether loading a file that another thread replaces by a hostile one runs code."""
+    good, evil = (folder / "model.zip").read_bytes(), (folder / "policy.pth.zip").read_bytes()
+    path, is_over = folder / "swapped.zip", threading.Event()
+
+    def swap() -> None:
+        while not is_over.is_set():
+            for content in (good, evil):
+                (folder / "next").write_bytes(content)
+                os.replace(folder / "next", path)
+
+    path.write_bytes(good)
+    thread = threading.Thread(target=swap)
+    thread.start()
+    ran = any([runs_code(EqRQRDQN.load, path) for _ in range(times)])
+    is_over.set()
+    thread.join()
+    return ran
 
 
 def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:

@@ -261,14 +261,14 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     :return: the resumed agent, the measurements so far, and whether it resumes bit for bit; if not, with a new episode
     """
     checkpoint, manifest = checkpoints.read_manifest(checkpoint)
-    is_exact = not manifest["hidden"] and not hasattr(model, "_last_lstm_states")  # SB3 does not save these
+    is_exact = not manifest["unknown"] and not hasattr(model, "_last_lstm_states")  # SB3 does not save these
     trust: dict[str, Any] = {"trust": True} if isinstance(model, SafeFiles) else {}  # the entry may name its own classes
     model = type(model).load(
         checkpoint / checkpoints.MODEL, env=model.get_env(), device=model.device, force_reset=not is_exact, **trust
     )
     if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
         model.load_replay_buffer(checkpoint / checkpoints.BUFFER, **trust)
-    is_exact = checkpoints.restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact)
+    checkpoints.restore_environment(model, manifest, is_exact)
     if not is_exact:
         buffer: Any = getattr(model, "replay_buffer", None)
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap

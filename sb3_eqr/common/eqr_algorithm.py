@@ -21,14 +21,14 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, check, check_arguments, number
 from sb3_eqr.common.checks.finite_data import FiniteData
-from sb3_eqr.common.checks.update_monitor import BadUpdateError, UpdateMonitor
+from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedGradients
 from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm, set_adam_defaults
 from sb3_eqr.common.objective import Objective, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
-from sb3_eqr.common.saving.models import SafeFiles, read_data
+from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
 from sb3_eqr.common.saving.transfer import load_representation, representation
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
@@ -234,7 +234,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
         of_network = {*self.policy.online.parameters()}  # the others are the latent model's own
         self._clipped = [[p for p in self._trained if (p in of_network) == is_network] for is_network in (True, False)]
-        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)
+        self._monitor = UpdateMonitor(self.policy)
         self._set_up_objective()
         keep_freed_memory()
 
@@ -431,17 +431,15 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _log_last_round(self, check_model: bool = False) -> None:
-        """Log the metrics of the last round, which are ready by now; roll back if a metric or the model is not finite."""
+        """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
         try:
             for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
                 for name, value in update.items():
                     self.logger.record_mean(f"train/{name}", value)
             if check_model:
                 self._monitor.check_model(self._n_updates)
-        except BadUpdateError as error:
-            self._n_updates = error.n_updates
-            self._resets.roll_back(error.n_updates)
-            raise BadUpdateError(f"step {self.num_timesteps}, {error}", error.n_updates) from None
+        except FloatingPointError as error:
+            raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
 
     def learn(
         self: SelfEqRAlgorithm,
@@ -474,8 +472,9 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         of the optimiser do not fit its parameters. After an error, all parameters are as before.
         """
         if not isinstance(load_path_or_dict, dict):
-            saved = read_data(load_path_or_dict).get("policy_description", {})
-            validation.check_same_parameters(self.policy_description, saved)
+            content = read_model(load_path_or_dict)
+            validation.check_same_parameters(self.policy_description, data_of(content).get("policy_description", {}))
+            load_path_or_dict = io.BytesIO(content)  # type: ignore[assignment]
         self._monitor.forget()
         before: Any = copy.deepcopy(self.get_parameters())
         try:
@@ -507,11 +506,10 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         load_representation(self.policy, path)
         self.representation_frozen = freeze
         self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
-        self._monitor = UpdateMonitor(self.policy, self.policy.optimizer)  # older backups are no longer valid
         return self
 
     def _before_saving(self) -> None:
-        self._log_last_round(check_model=True)  # rolls back instead of saving a model that is not finite
+        self._log_last_round(check_model=True)  # which never writes a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
         return [

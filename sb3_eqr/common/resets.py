@@ -69,10 +69,6 @@ class Resets:
         interval = self.schedule.interval
         return interval is not None and self.updates_since(n_updates) >= interval and n_left >= interval
 
-    def roll_back(self, n_updates: int) -> None:
-        """Forget the resets made after ``n_updates`` updates."""
-        self.done = [reset for reset in self.done if reset < n_updates]
-
     def annealed(self, n_updates: int, n_steps: int, gamma: float) -> tuple[int, float]:
         """
         n and γ after ``n_updates`` updates; ``n_steps`` and ``gamma`` are the values at the end of annealing. Annealing is

@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_eqr.common.saving.env_state import ResumableWrapper
 from sb3_eqr.envs.atari import make_atari100k_env
 from sb3_eqr.envs.blind_cliffwalk import BlindCliffwalk
 from sb3_eqr.envs.minatar import register_minatar
@@ -59,4 +60,4 @@ def import_packages(packages: Iterable[str]) -> None:
             ) from error
 
 
-__all__ = ["BlindCliffwalk", "PixelPendulum", "SlidingBall", "StarField", "make_atari100k_env", "register"]
+__all__ = ["BlindCliffwalk", "PixelPendulum", "ResumableWrapper", "SlidingBall", "StarField", "make_atari100k_env", "register"]

@@ -3,9 +3,7 @@
 import ast
 import difflib
 import importlib
-import json
 import pathlib
-import zipfile
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 import sb3_eqr.envs
 from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.saving.models import is_whole_model
+from sb3_eqr.common.saving.models import data_of, read_model
 from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.visualize.latents import FACTOR_KEYS
 
@@ -33,8 +31,6 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
     if not path.is_file():
         example = "such as logs/eqr_qrdqn/ENV_1/ENV.zip"
         raise ValueError(f"MODEL must be the path of a .zip file, {example}, got {str(path)!r}, which does not exist.")
-    if not is_whole_model(path):
-        raise ValueError(f"{path} must be a file written by an agent's save, got a truncated file or another kind of file.")
     try:
         return AGENTS[algo or find_algorithm(path)].load(path, device=device, trust=trust)
     except (TypeError, RuntimeError) as error:
@@ -45,13 +41,11 @@ def find_algorithm(path: pathlib.Path) -> str:
     """
     Detect the algorithm from the module of the policy's class, which is plain text: nothing is unpickled.
 
-    :param path: path of a complete file
+    :param path: a saved agent
     :return: one of ``AGENTS``
     :raises ValueError: if the policy is not one of this package's
     """
-    with zipfile.ZipFile(path) as archive:
-        data = json.loads(archive.read("data"))
-    saved = data.get("policy_class", {})
+    saved = data_of(read_model(path)).get("policy_class", {})
     module = str(saved.get("module", saved.get("__module__")))
     for name in AGENTS:
         if module.startswith(f"sb3_eqr.{name}."):

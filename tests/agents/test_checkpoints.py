@@ -3,9 +3,13 @@
 import subprocess
 import sys
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
@@ -72,7 +76,7 @@ def checkpoint(tmp_path):
     return found
 
 
-@pytest.mark.parametrize("name", ["model.zip", "replay_buffer.pkl", "environment.json", "manifest.json"])
+@pytest.mark.parametrize("name", ["model.zip", "replay_buffer.pkl", "manifest.json"])
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
 def test_a_damaged_checkpoint_raises(checkpoint, name, damage):
     path = checkpoint / name
@@ -103,37 +107,42 @@ def test_an_environment_state_that_cannot_be_saved_warns(tmp_path):
     EqRQRDQN("MlpPolicy", env, **SMALL).learn(60, ExactCheckpointCallback(60, tmp_path))
     env.obs_rms.mean[:] = 7.0
     write_checkpoint(tmp_path / "by hand", EqRQRDQN("MlpPolicy", env, **SMALL))
-    with pytest.warns(UserWarning, match=r"cannot be saved \(.*world.*new episodes"):
+    with pytest.warns(UserWarning, match=r"the state of .*LunarLander is not known.*new episodes"):
         model = EqRQRDQN.resume(tmp_path / "by hand", VecNormalize(make_vec_env("LunarLander-v3", 1)))
     assert (model.get_vec_normalize_env().obs_rms.mean == 7.0).all()  # the statistics are not lost
     model.learn(10, reset_num_timesteps=False)
 
 
-class GrowingEnv(ChainEnv):
-    """Creates an object in each step."""
+def ring(length=20):
+    """An environment whose state is in a closure."""
+    place = 0
 
-    def __init__(self):
-        super().__init__()
-        self.things = []
+    class Ring(gym.Env):
+        observation_space, action_space = spaces.Box(-1, 1, (3,), np.float32), spaces.Discrete(3)
 
-    def reset(self, *, seed=None, options=None):
-        found = super().reset(seed=seed)
-        self.begun = float(self.np_random.random())
-        return found
+        def reset(self, *, seed=None, options=None):
+            nonlocal place
+            super().reset(seed=seed)
+            place, self.begun = 0, float(self.np_random.random())
+            return np.zeros(3, dtype=np.float32), {}
 
-    def step(self, action):
-        self.things.append(ChainEnv())
-        return super().step(action)
+        def step(self, action):
+            nonlocal place
+            place += 1
+            return np.full(3, place / length, dtype=np.float32), 1.0, place == length, False, {}
+
+    return Ring()
 
 
-def test_an_environment_that_creates_objects_is_resumed_with_new_episodes(tmp_path):
-    EqRQRDQN("MlpPolicy", GrowingEnv(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
-    with pytest.warns(UserWarning, match=r"cannot be saved \(.*things\[0\].*new episodes"):
-        model = EqRQRDQN.resume(tmp_path, GrowingEnv())
+def test_an_environment_of_an_unknown_class_is_resumed_with_new_episodes(tmp_path):
+    EqRQRDQN("MlpPolicy", ring(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
+    with pytest.warns(UserWarning, match=r"the state of .*Ring is not known.*state_dict and load_state_dict") as caught:
+        model = EqRQRDQN.resume(tmp_path, ring())
+    assert sum("is not known" in str(warning.message) for warning in caught) == 1
     assert model._last_obs is None
     model.learn(20, reset_num_timesteps=False)
     begun = model.env.envs[0].unwrapped.begun
-    first = GrowingEnv()
+    first = ring()
     first.reset(seed=SMALL["seed"])
     assert first.begun != begun  # the run's first episode is not played again
 
@@ -187,7 +196,7 @@ class OtherEnv(ChainEnv):
 
 
 def test_runs_in_different_environments_cannot_share_a_folder(checkpoint):
-    with pytest.raises(ValueError, match="environment = 'ChainEnv' there, 'OtherEnv' here"):
+    with pytest.raises(ValueError, match=r"environment = \{'id': 'ChainEnv'\} there, \{'id': 'OtherEnv'\} here"):
         EqRQRDQN("MlpPolicy", OtherEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, checkpoint.parent))
 
 
@@ -214,10 +223,31 @@ def test_a_run_cannot_restart_in_its_folder(seed, tmp_path):
 
 
 def test_the_environment_must_be_built_in_the_same_way(checkpoint):
-    with pytest.raises(ValueError, match=r"must be a DummyVecEnv, got VecNormalize: .*including VecNormalize"):
+    with pytest.raises(ValueError, match=r"must be DummyVecEnv, got VecNormalize in DummyVecEnv: .*including VecNormalize"):
         EqRQRDQN.resume(checkpoint, VecNormalize(make_vec_env(ChainEnv)))
     with pytest.raises(ValueError, match="env must be an environment, built as in the original run"):
         EqRQRDQN.resume(checkpoint, None)
+
+
+def test_an_environment_of_another_id_is_refused_and_other_arguments_are_named(tmp_path):
+    EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(60, ExactCheckpointCallback(50, tmp_path))
+    with pytest.raises(
+        ValueError, match=r"must be the environment of the original run.*id = 'CartPole-v1' there, 'CartPole-v0' here"
+    ):
+        EqRQRDQN.resume(tmp_path, make_vec_env("CartPole-v0"))
+    shorter = make_vec_env("CartPole-v1", env_kwargs={"max_episode_steps": 50, "sutton_barto_reward": True})
+    with pytest.warns(UserWarning, match=r"max_episode_steps = 500 there, 50 here, kwargs = .* there, .*sutton_barto"):
+        model = EqRQRDQN.resume(tmp_path, shorter)
+    model.learn(20, reset_num_timesteps=False)
+    assert model.env.get_attr("_max_episode_steps") == [50]
+
+
+def test_inside_another_callback_it_refuses_to_do_nothing(tmp_path):
+    model = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL)
+    with pytest.raises(ValueError, match="must be given to learn itself, alone or in a list, got it inside another callback"):
+        model.learn(60, EveryNTimesteps(20, ExactCheckpointCallback(20, tmp_path)))
+    model.learn(60, CallbackList([ExactCheckpointCallback(20, tmp_path)]))
+    assert find_checkpoints(tmp_path)
 
 
 def test_stock_agents_cannot_resume(tmp_path):

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from experiments.attacks.inputs import wrong_arguments
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.eqr_rainbow import eqr_rainbow
-from tests.models import EITHER, PAPER, SMALL, loss_terms
+from tests.models import EITHER, PAPER, SMALL
 from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv
 
 
@@ -140,11 +140,13 @@ def test_observations_that_are_not_a_frame_stack(make):
 @EITHER
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("normalize", [False, True])
-@pytest.mark.parametrize("where, what", [("obs", "observation"), ("reward", "reward"), ("terminal", "observation")])
+@pytest.mark.parametrize("where, what", [("obs", "next_obs"), ("reward", "reward"), ("terminal", "next_obs")])
 def test_bad_values_from_the_environment(make, where, what, value, normalize):
+    if normalize and where != "reward" and value == np.inf:
+        return  # VecNormalize has clipped it, where the episode ends
     env = make_vec_env(lambda: PoisonEnv(where, value, at=60))
     model = make(VecNormalize(env) if normalize else env)
-    with pytest.raises(ValueError, match=f"step 60: .*{what}s from the environment must be finite, got (nan|-?inf)"):
+    with pytest.raises(ValueError, match=f"step 60: {what} must be finite, got (nan|-?inf)"):
         model.learn(100)
     assert model.replay_buffer.size() == 59 and model._n_updates > 0
     if normalize:
@@ -168,9 +170,15 @@ def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, w
         assert found.count == expected.count
 
 
-def test_discrete_observations_behind_vec_normalize(make):
-    """Their terminal observation is a Python int, and it is stored."""
-    env = VecNormalize(make_vec_env(IntegerEnv), norm_obs_keys=["count"])
+def test_integers_behind_vec_normalize(make):
+    """SB3 would scale their terminal observations, clip them, scale them back and cut them to integers."""
+    with pytest.raises(
+        ValueError, match=r"must normalise floats, got integers of 'count'\. Pass norm_obs=False, or norm_obs_keys"
+    ):
+        make(VecNormalize(make_vec_env(IntegerEnv), norm_obs_keys=["count"]), "MultiInputPolicy")
+    with pytest.raises(ValueError, match=r"must normalise floats, got integers\. .*DtypeObservation"):
+        make(VecNormalize(VecTransposeImage(make_vec_env(ImageEnv))), "CnnPolicy")
+    env = VecNormalize(make_vec_env(IntegerEnv), norm_obs=False)
     model = make(env, "MultiInputPolicy", learning_starts=1_000).learn(20)
     stored = model.replay_buffer.windows(np.array([6]), np.array([0])).rollout_observations["kind"]
     assert int(stored[0, 0]) == 7 and model.replay_buffer.dones[6] == 1
@@ -182,94 +190,67 @@ def test_observations_of_predict_must_be_finite(make, value, dtype):
     model = make(ChainEnv())
     with pytest.raises(ValueError, match=f"observation must be finite, got {value}"):
         model.predict(np.array([0.0, value, 0.0], dtype=dtype))
+    for other in ([0.0, value, 0.0], th.tensor([0.0, value, 0.0])):
+        with pytest.raises(ValueError, match=f"observation must be finite, got {value}"):
+            model.predict(other)
 
 
-def test_a_bad_first_observation_raises_before_the_first_step(make):
+def test_a_bad_first_observation_is_not_stored(make):
     model = make(PoisonEnv("reset"))
-    with pytest.raises(ValueError, match="step 0: observations from the environment must be finite"):
+    with pytest.raises(ValueError, match=r"step 1: obs must be finite, got nan.*Nothing was stored\. The model is unchanged"):
         model.learn(10)
-    assert model.num_timesteps == 0
+    assert model.replay_buffer.size() == 0
 
 
-@pytest.mark.parametrize("trained", [0, 5])
-@pytest.mark.usefixtures("backup_each_round")
-def test_losses_that_are_not_finite_restore_the_last_good_model(make, trained, tmp_path):
-    """The first loss of a round is computed after the previous round, so the model is restored to the start of that round."""
-    model = make(ChainEnv()).learn(40 + trained)
-    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    slots, updates = len(model.policy.optimizer.state), model._n_updates
-    model.learn(1, reset_num_timesteps=False)
-    assert model._n_updates == updates + 2
+def test_losses_that_are_not_finite_raise_and_the_model_is_never_saved(make, tmp_path):
+    model = make(ChainEnv()).learn(46)
+    updates = model._n_updates
+    model.save(tmp_path / "good")
     model.replay_buffer.rewards[:] = 3e38  # finite, but its square and its double are not
     model.train(gradient_steps=2, batch_size=8)
-    assert not all(th.isfinite(p).all() for p in model.policy.parameters())
-    message = f"update {updates + 3}: losses must be finite, got .*reward_loss = inf.* rolled back to update {updates} "
-    with pytest.raises(FloatingPointError, match=message):
-        model.save(tmp_path / "model")
-    after = model.policy.state_dict()
-    assert all(th.equal(good[name], after[name]) for name in good)
-    assert len(model.policy.optimizer.state) == slots and model._n_updates == updates
-    states = [value for state in model.policy.optimizer.state.values() for value in state.values()]
-    assert all(th.isfinite(value).all() for value in states)
-    assert list(tmp_path.iterdir()) == []
-    model.save(tmp_path / "model")  # the restored model can be saved
-    assert make.algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
+    for name in ("model", "good"):
+        with pytest.raises(
+            FloatingPointError, match=r"step 46, update \d+: (losses|parameters) must be finite, got .*checkpoint"
+        ):
+            model.save(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["good.zip"]
+    good = make.algorithm.load(tmp_path / "good", ChainEnv())
+    good.replay_buffer.rewards[:] = 0.0
+    good.learn(60, reset_num_timesteps=False)
+    assert good._n_updates > updates and all(th.isfinite(p).all() for p in good.policy.parameters())
 
 
-@pytest.mark.usefixtures("backup_each_round")
-def test_the_first_update_may_be_bad(make):
-    model = make(ChainEnv(), learning_starts=1000).learn(60)
-    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    model.replay_buffer.rewards[:] = 1e38
-    model.train(gradient_steps=3, batch_size=8)
-    with pytest.raises(FloatingPointError, match="update 1: "):
-        model.dump_logs()
-    assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
-    model.replay_buffer.rewards[:] = 0.0
-    model.train(gradient_steps=2, batch_size=8)
-    model.dump_logs()
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
-
-
-def test_parameters_set_later_are_those_rolled_back_to(make):
+def test_the_first_bad_update_is_named(make):
     model = make(ChainEnv()).learn(46)
-    model.set_parameters(make(ChainEnv(), seed=1).get_parameters())
-    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    model.replay_buffer.rewards[:] = 1e38
+    updates = model._n_updates
+    model.train(gradient_steps=1, batch_size=8)
+    model.replay_buffer.rewards[:] = 3e38
     model.train(gradient_steps=2, batch_size=8)
-    with pytest.raises(FloatingPointError, match="was rolled back"):
+    with pytest.raises(
+        FloatingPointError, match=rf"step 46, update {updates + 2}: losses must be finite, got .*reward_loss = inf"
+    ):
         model.dump_logs()
-    assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
 
 
 @EITHER
-@pytest.mark.parametrize("gradient_steps", [1, 2, 3])
-@pytest.mark.parametrize("good_rounds", [0, 1, 4])
-@pytest.mark.usefixtures("backup_each_round")
-def test_an_explosion_in_the_last_step_of_a_round_restores_the_model(make, gradient_steps, good_rounds):
+@pytest.mark.parametrize("gradient_steps", [1, 3])
+def test_an_explosion_is_found_in_the_next_round(make, gradient_steps):
     """The losses of an update do not show the effect of its own step; those of the next round do."""
     model = make(ChainEnv(), gradient_steps=gradient_steps, learning_starts=40)
-    sizes = []
 
     class Callback(BaseCallback):
         def _on_step(self):
-            rounds = model._n_updates // gradient_steps
-            if rounds == good_rounds and not sizes:
-                sizes.append(model._n_updates)
+            if self.num_timesteps == 44:
                 model.lr_schedule = lambda progress: 1e30
             return True
 
-    with pytest.raises(FloatingPointError, match="Lower learning_rate"):
+    with pytest.raises(FloatingPointError, match=r"must be finite, got .*lower learning_rate"):
         model.learn(200, callback=Callback())
-    assert model._n_updates == sizes[0] == good_rounds * gradient_steps
-    assert max(p.abs().max().item() for p in model.policy.parameters()) < 100
-    assert th.isfinite(loss_terms(model, model.replay_buffer.sample(8)).loss)
-    model.lr_schedule = lambda progress: 1e-4
-    model.learn(5, reset_num_timesteps=False)
+    assert model.num_timesteps < 50
 
 
 @EITHER
-def test_the_last_update_is_checked_before_learn_returns(make, tmp_path):
+def test_the_last_update_is_checked_before_learn_returns(make):
     """Its losses are finite, and only the parameters show the effect of its step."""
     model = make(ChainEnv(), learning_starts=40, gradient_steps=1)
 
@@ -281,15 +262,13 @@ def test_the_last_update_is_checked_before_learn_returns(make, tmp_path):
 
     with pytest.raises(FloatingPointError, match=r"step 60, update \d+: parameters must be finite, got (nan|inf)\. The model"):
         model.learn(60, callback=Callback())
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
-    model.save(tmp_path / "model")
 
 
 def test_parameters_that_are_not_finite_are_never_saved(make, tmp_path):
     model = make(ChainEnv())
     with th.no_grad():
         next(model.policy.parameters())[0] = float("nan")
-    with pytest.raises(FloatingPointError, match="No finite model is left to roll back to"):
+    with pytest.raises(FloatingPointError, match="update 0: parameters must be finite, got nan"):
         model.save(tmp_path / "model")
     assert list(tmp_path.iterdir()) == []
 
@@ -417,6 +396,9 @@ def test_buffer_add_checks_its_arguments(make):
         buffer.add(obs, obs, zero, one * np.inf, zero, [{}])
     with pytest.raises(ValueError, match=r"next_obs must be finite, got 1e\+39"):  # not representable in float32
         buffer.add(obs, obs + 1e39, zero, one, zero, [{}])
+    for done in (["False"], [0.3], [np.nan], [None]):
+        with pytest.raises(ValueError, match="done must be True or False, got"):
+            buffer.add(obs, obs, zero, one, np.array(done), [{}])
     assert buffer.size() == 0
 
 

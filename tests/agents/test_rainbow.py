@@ -11,7 +11,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRRainbow
-from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
@@ -326,18 +325,6 @@ def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
     assert model._n_updates > 4
 
 
-@pytest.mark.usefixtures("backup_each_round")
-def test_rounds_without_updates_keep_the_last_good_model(make):
-    """The model has become NaN, and some rounds without updates pass before this is noticed."""
-    model = wait_for_a_longer_window(make)
-    with th.no_grad():
-        next(model.policy.online.features_extractor.parameters()).fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match=r"got nan\. The model was rolled back to update 2 "):
-        model.learn(8, reset_num_timesteps=False)
-    assert all(th.isfinite(p).all() for p in model.policy.parameters()) and model._resets.done == []
-    model.learn(40, reset_num_timesteps=False)
-
-
 def test_resets_are_postponed_to_the_next_call_of_learn():
     """A reset due in the last tenth of a call of ``learn`` is done in the next call."""
     model = make_rainbow(ChainEnv(), resets={"interval": 30}).learn(60)
@@ -373,93 +360,6 @@ def test_a_reset_initialises_a_custom_policy_with_its_arguments():
     model.set_logger(configure(None, []))
     model._reset()
     assert all((parameter == 0).all() for parameter in model.q_net.head.parameters())
-
-
-@pytest.mark.usefixtures("backup_each_round")
-def test_a_bad_update_right_after_a_reset_reverts_the_reset(make, monkeypatch):
-    """The bad update is the second one of the round with the reset, so the model is restored to before the reset."""
-    model = make(ChainEnv(), resets={"interval": 40}).learn(60)
-    assert model._n_updates == 40 and model._resets.done == []
-    good = {name: p.clone() for name, p in model.policy.state_dict().items()}
-    moments = {(p, k): v.clone() for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
-    model._total_timesteps = 120  # as in the middle of a run
-    add = model._monitor.add
-
-    def poisoned(metrics):  # called at the end of the first update
-        add(metrics)
-        model.replay_buffer.rewards[:] = 1e38
-
-    monkeypatch.setattr(model._monitor, "add", poisoned)
-    model.train(gradient_steps=2, batch_size=8)
-    assert model._resets.done == [40]
-    with pytest.raises(FloatingPointError, match=r"update 42: .*rolled back to update 40 "):
-        model.dump_logs()
-    assert model._resets.done == [] and model._n_updates == 40
-    assert all(th.equal(good[name], p) for name, p in model.policy.state_dict().items())
-    found = {(p, k): v for p, state in model.policy.optimizer.state.items() for k, v in state.items()}
-    assert found.keys() == moments.keys() and all(th.equal(found[key], moments[key]) for key in found)
-    monkeypatch.undo()
-    model.replay_buffer.rewards[:] = 0.0
-    model.train(gradient_steps=2, batch_size=8)
-    model.dump_logs()
-    assert model._resets.done == [40] and all(th.isfinite(p).all() for p in model.policy.parameters())
-
-
-def test_optimizer_state_cleared_by_a_reset_is_restored():
-    layer = th.nn.Linear(2, 2)
-    optimizer = th.optim.Adam(layer.parameters())
-    layer(th.ones(1, 2)).sum().backward()
-    optimizer.step()
-    monitor = UpdateMonitor(layer, optimizer)
-    monitor.start_round(1)
-    before = optimizer.state[layer.weight]["exp_avg"].clone()
-    optimizer.state.clear()
-    monitor.add({"loss": th.tensor(float("nan"))})
-    with pytest.raises(FloatingPointError):
-        monitor.collect()
-    assert th.equal(optimizer.state[layer.weight]["exp_avg"], before) and len(optimizer.state) == 2
-
-
-def test_the_interval_of_backups():
-    """With rounds of 20 updates, and a backup after at least 50, backups are at 0, 60 and 120."""
-    layer = th.nn.Linear(1, 1)
-    monitor = UpdateMonitor(layer, th.optim.SGD(layer.parameters()))
-
-    def round_of_updates(n_updates, loss):
-        monitor.start_round(n_updates)
-        with th.no_grad():
-            layer.weight.fill_(n_updates + 20)
-        for value in (1.0,) * 19 + (loss,):
-            monitor.add({"loss": th.tensor(value)})
-        return monitor.collect()
-
-    for n_updates in (0, 20, 40, 60, 80, 100, 120):
-        assert round_of_updates(n_updates, 1.0) == [{"loss": 1.0}] * 20
-    with pytest.raises(FloatingPointError, match=r"update 160: .*rolled back to update 120 "):
-        round_of_updates(140, float("nan"))
-    assert layer.weight.item() == 120
-
-
-@pytest.mark.parametrize("bad, restored", [(0, 0), (1, 0), (2, 0), (3, 2), (4, 2), ("model", 2)])
-def test_the_newest_backup_known_to_be_finite_is_restored(monkeypatch, bad, restored):
-    """
-    Rounds of one update, backups at 0 and 2. The loss of an update is that of the model before it: if it is bad right after
-    a backup, the backup is bad, too.
-    """
-    monkeypatch.setattr(UpdateMonitor, "INTERVAL", 2)
-    layer = th.nn.Linear(1, 1)
-    monitor = UpdateMonitor(layer, th.optim.SGD(layer.parameters()))
-    with pytest.raises(FloatingPointError, match=f"rolled back to update {restored} "):
-        for n_updates in range(4 if bad == "model" else bad + 1):
-            monitor.collect()
-            with th.no_grad():
-                layer.weight.fill_(n_updates)
-            monitor.start_round(n_updates)
-            monitor.add({"loss": th.tensor(float("nan") if n_updates == bad else 1.0)})
-        monitor.collect()
-        layer.weight.data.fill_(float("nan"))
-        monitor.check_model(4)
-    assert layer.weight.item() == restored
 
 
 # ---------------------------------------------------------------------------------------------- optimiser, trunk

@@ -419,7 +419,7 @@ def test_loading_executes_no_code(make, tmp_path, monkeypatch):
         model.load_replay_buffer("buffer")
     with open("buffer.pkl", "wb") as file:
         np.savez(file, data=np.array([Runs()], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
+    with pytest.raises(ValueError, match=r"must be a complete replay buffer written by .*another zip file"):
         model.load_replay_buffer("buffer")
     assert not pathlib.Path("ran").exists()
 
@@ -452,7 +452,7 @@ def test_a_save_that_fails_leaves_the_old_file(make, tmp_path, monkeypatch):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(th, "save", break_off)
-    monkeypatch.setattr(np, "savez", break_off)
+    monkeypatch.setattr(zipfile.ZipFile, "open", break_off)
     for save in (model.save, model.save_replay_buffer):
         with pytest.raises(OSError, match="No space"):
             save(tmp_path / ("model" if save == model.save else "buffer"))

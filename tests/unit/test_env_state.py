@@ -1,26 +1,23 @@
 """The state of an environment, captured and restored into another one built in the same way: both then behave the same."""
 
-import dataclasses
-import enum
 import json
-import random
-from collections import deque
-from typing import NamedTuple
+import os
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
-from gymnasium import spaces
+from gymnasium import wrappers
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_eqr import envs
-from sb3_eqr.common.saving.env_state import MissingObjectError, capture, restore
-from sb3_eqr.envs.minatar import ChannelsFirstImage
-from tests.toys import ChainEnv, ImageEnv
+from sb3_eqr.common.saving.env_state import ATTRIBUTES, capture, restore
+from sb3_eqr.envs import ResumableWrapper
+from sb3_eqr.envs.minatar import GAMES, ChannelsFirstImage
+from tests.toys import ChainEnv, DictEnv, ImageEnv
 
 envs.register()
+TORUS = {"goal": [0.5, 0.5], "n_distractors": 2}
 
 
 def atari(seed):
@@ -28,20 +25,33 @@ def atari(seed):
     return envs.make_atari100k_env("Pong", n_envs=2, seed=seed)
 
 
-def minatar(seed):
-    pytest.importorskip("minatar")
-    return VecFrameStack(make_vec_env("MinAtar/SpaceInvaders-v1", 2, seed, wrapper_class=ChannelsFirstImage), 2)
+def minatar(game):
+    def make(seed):
+        pytest.importorskip("minatar")
+        return VecFrameStack(make_vec_env(f"MinAtar/{game}-v1", 2, seed, wrapper_class=ChannelsFirstImage), 2)
+
+    return make
+
+
+def timed(env):
+    return wrappers.TimeAwareObservation(wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env)))
 
 
 WORLDS = {
-    "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 3, seed)),
-    "acrobot": lambda seed: make_vec_env("Acrobot-v1", 2, seed),
-    "lake": lambda seed: make_vec_env("FrozenLake-v1", 2, seed),
+    "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 4, seed)),
+    "processes": lambda seed: VecNormalize(
+        make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
+    ),
+    "statistics": lambda seed: VecMonitor(DummyVecEnv([lambda: timed(gym.make("CartPole-v1"))])),
+    **{
+        name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1")
+    },
+    **{name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in ("Taxi-v4", "CliffWalking-v1", "StarField-v0")},
     "chain": lambda seed: make_vec_env(ChainEnv, 2, seed),
-    "images": lambda seed: VecFrameStack(make_vec_env(ImageEnv, 2, seed), 4),
-    "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs={"goal": [0.5, 0.5], "n_distractors": 2}),
-    "pendulum": lambda seed: make_vec_env("PixelPendulum-v0", 2, seed),
-    "minatar": minatar,
+    "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs=TORUS),
+    "pendulum": lambda seed: VecFrameStack(make_vec_env("PixelPendulum-v0", 2, seed), 4),
+    "cliffwalk": lambda seed: make_vec_env("BlindCliffwalk-v0", 2, seed),
+    **{f"minatar {game}": minatar(game) for game in GAMES},
     "atari": atari,
 }
 
@@ -50,8 +60,9 @@ def play(env, actions):
     seen = []
     for action in actions:
         observations, rewards, dones, infos = env.step(action)
-        infos = [{key: value for key, value in info.items() if key != "episode"} for info in infos]  # has wall-clock times
-        seen.append((observations.copy(), rewards.copy(), dones.copy(), [sorted(info) for info in infos]))
+        infos = [{key: value for key, value in info.items() if key not in ("episode", "t")} for info in infos]  # wall-clock
+        observations = observations if isinstance(observations, dict) else {"": observations}
+        seen.append(({k: x.copy() for k, x in observations.items()}, rewards.copy(), dones.copy(), [sorted(i) for i in infos]))
     return seen
 
 
@@ -64,194 +75,131 @@ def test_original_and_restored_environment_behave_the_same(name):
     second.reset()
     play(first, actions[:37])
     play(second, actions[50:61])
-    state, hidden = capture(first)
-    assert not hidden
+    state, unknown = capture(first)
+    assert not unknown
     text = json.dumps(state)
     assert '": "pickle"' not in text
-    restore(second, json.loads(text))
+    restore(second, json.loads(text), wrappers_only=False)
     for (a, b, c, d), (e, f, g, h) in zip(play(first, actions[37:]), play(second, actions[37:]), strict=True):
-        assert np.array_equal(a, e) and np.array_equal(b, f) and np.array_equal(c, g) and d == h
+        assert all(np.array_equal(a[key], e[key]) for key in a | e)
+        assert np.array_equal(b, f) and np.array_equal(c, g) and d == h
+    first.close(), second.close()
 
 
-class Phase(enum.Enum):
-    DAY, NIGHT = "day", "night"
+@pytest.mark.parametrize("make", [DictEnv, ImageEnv])
+def test_an_unknown_class_is_named_and_its_wrappers_are_restored(make):
+    first, second = (VecNormalize(make_vec_env(make, 1), norm_obs=make is DictEnv) for _ in range(2))
+    first.reset(), second.reset()
+    play(first, [[0]] * 5)
+    state, unknown = capture(first)
+    assert unknown == [f"tests.toys.{make.__name__}"]
+    restore(second, state, wrappers_only=True)
+    assert second.ret_rms.count == first.ret_rms.count > 1
+    hidden = SubprocVecEnv([make])
+    assert capture(hidden)[1] == ["stable_baselines3.common.vec_env.subproc_vec_env.SubprocVecEnv"]
+    hidden.close()
 
 
-class Tool(enum.IntEnum):
-    NONE, KEY = 0, 1
+def test_parameters_belong_to_the_new_environment():
+    def shorter(env):
+        env.unwrapped.gravity = 25.0
+        return env
 
-
-class Pair(NamedTuple):
-    x: int
-    y: int
-
-
-START = np.zeros(2)
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    size: int
-    field: np.ndarray
-
-
-class Room:
-    def __init__(self, name):
-        self.name, self.light = name, 0
-
-
-class House:
-    """An environment with state of many kinds."""
-
-    def __init__(self):
-        self.rng, self.weights = random.Random(3), th.zeros(2)
-        self.phase, self.tool = Phase.DAY, Tool.NONE
-        self.settings = Settings(4, np.zeros(2))
-        self.rooms = [Room("hall"), Room("kitchen")]
-        self.room = self.rooms[0]
-        self.grid = np.zeros(3)
-        self.shown = self.grid
-        self.by_phase = {None: 0, ("a", 1): 2}
-        self.body, self.last, self.noise, self.name, self.visited = [], None, None, None, set()
-        self.pair = Pair(0, 0)
-        self.pieces = np.zeros((2, 2))
-        self.row = self.pieces[1]
-        self.space = spaces.Dict(x=spaces.Discrete(1000, seed=3))
-        self.place = START
-        self.myself = self
-
-    def live(self):
-        self.rng.random()
-        self.weights = self.weights + 1.5
-        self.phase, self.tool = Phase.NIGHT, Tool.KEY
-        self.room = self.rooms[1]
-        self.room.light += 1
-        self.settings.field[:] = 7
-        self.grid[1] = 5
-        self.by_phase[None] = 9
-        self.body.append((1, 2))
-        self.body.append(self.body)
-        self.last, self.noise, self.name = (3, b"ab"), deque([1, 2], maxlen=2), b"x"
-        self.visited.add((1, 2))
-        self.pair = Pair(4, 5)
-        self.row[:] = 6
-        self.space.sample()
-        self.place = self.place + 1
-
-
-def moved(house):
-    text = json.dumps(capture(house)[0])
-    assert '": "pickle"' not in text
-    fresh = House()
-    restore(fresh, json.loads(text))
-    return fresh
-
-
-def test_values_of_many_kinds_are_restored():
-    house = House()
-    house.live()
-    assert capture(house)[1] == []
-    other = moved(house)
-    assert other.rng.random() == house.rng.random()
-    assert other.weights.tolist() == [1.5, 1.5]
-    assert other.phase is Phase.NIGHT and other.tool is Tool.KEY and [phase.value for phase in Phase] == ["day", "night"]
-    assert other.room is other.rooms[1] and [room.light for room in other.rooms] == [0, 1]
-    assert other.settings.size == 4 and other.settings.field.tolist() == [7, 7]
-    assert other.shown is other.grid and other.grid.tolist() == [0, 5, 0]
-    assert other.by_phase == {None: 9, ("a", 1): 2} and other.myself is other
-    assert other.body[0] == (1, 2) and type(other.body[0]) is tuple and other.body[1] is other.body
-    assert (other.last, other.noise, other.name) == ((3, b"ab"), deque([1, 2]), b"x") and other.noise.maxlen == 2
-    assert other.visited == {(1, 2)} and other.pair == Pair(4, 5) and type(other.pair) is Pair
-    other.row[:] = 8
-    assert other.pieces.tolist() == [[0, 0], [8, 8]]  # still a view
-    assert other.space.sample() == house.space.sample()
-    assert other.place.tolist() == [1, 1] and START.tolist() == [0, 0]
-
-
-def test_objects_that_only_the_original_run_created_are_named():
-    house = House()
-    house.rooms.append(Room("attic"))
-    with pytest.raises(MissingObjectError, match=r"House.rooms\[2\] must be the original object"):
-        moved(house)
-
-
-def test_objects_that_the_run_moved_to_the_place_of_others_are_named():
-    class Flat:
-        def __init__(self):
-            self.room = None
-            self.rooms = [Room("hall"), Room("kitchen")]
-            self.room = self.rooms[0]
-
-    flat, fresh = Flat(), Flat()
-    state = capture(flat)[0]
-    restore(fresh, state)
-    assert fresh.room is fresh.rooms[0]
-    flat.room = flat.rooms[1]
-    with pytest.raises(MissingObjectError, match=r"Flat.rooms\[0\]"):
-        restore(Flat(), capture(flat)[0])
-
-
-def test_objects_with_state_in_c_are_named(tmp_path):
-    class Queue(bytearray):
-        pass
-
-    class Generator(random.Random):
-        pass
-
-    class Slotted:
-        __slots__ = ("__dict__", "speed")
-
-    house = House()
-    house.queue, house.slotted, house.plain = Queue(b"ab"), Slotted(), Room("x")
-    house.generator, house.masked = Generator(3), np.ma.masked_array([1, 2], [True, False])
-    (tmp_path / "steps.txt").write_text("1 2 3")
-    with open(tmp_path / "steps.txt") as house.file:
-        assert capture(house)[1] == [".queue", ".slotted", ".generator", ".masked", ".file"]
-    assert ".file" not in capture(house)[1]  # a closed file has no state
-
-
-def test_state_that_cannot_be_captured_is_named():
-    pytest.importorskip("Box2D")
-    env = make_vec_env("LunarLander-v3", 1)
-    env.reset()
-    _, hidden = capture(env)
-    assert any("world" in path for path in hidden)
+    first = make_vec_env("CartPole-v1", 1)
+    second = make_vec_env("CartPole-v1", 1, wrapper_class=shorter, env_kwargs={"max_episode_steps": 50})
+    first.reset(), second.reset()
+    play(first, [[0], [1], [0]])
+    restore(second, capture(first)[0], wrappers_only=False)
+    env = second.envs[0].unwrapped
+    assert (env.gravity, second.envs[0].spec.max_episode_steps) == (25.0, 50)
+    assert second.get_attr("_max_episode_steps") == [50] and second.get_attr("_elapsed_steps") == [3]
 
 
 def test_a_different_environment_raises():
-    first, second = (
-        make_vec_env("CartPole-v1", 1),
-        make_vec_env("CartPole-v1", 1, wrapper_class=gym.wrappers.FlattenObservation),
-    )
-    first.reset()
-    second.reset()
-    state, _ = capture(second)
-    with pytest.raises(ValueError, match="must be an object, got nothing: the environment is not built as"):
-        restore(first, state)
+    first = make_vec_env("CartPole-v1", 1)
+    flat = make_vec_env("CartPole-v1", 1, wrapper_class=gym.wrappers.FlattenObservation)
+    for env in (first, flat):
+        env.reset()
+    with pytest.raises(
+        ValueError, match=r"env must be FlattenObservation in Monitor in .* got Monitor in .* is not built as in"
+    ):
+        restore(first, capture(flat)[0], wrappers_only=False)
+    with pytest.raises(ValueError, match="n_envs must be 1, as in the original run, got 2"):
+        restore(make_vec_env("CartPole-v1", 2), capture(first)[0], wrappers_only=False)
 
 
-def attributes(number, **children):
-    return {":kind:": "attributes", ":number:": number, **children}
+def changed(state, name, value):
+    """The state with another value of an attribute of the innermost environment or of a wrapper."""
+    state = json.loads(json.dumps(state))
+    for _, found in state["envs"][0]:
+        if name in found:
+            found[name] = value
+    return state
 
 
-@pytest.mark.parametrize("name", ["step", "render", "__class__", "__dict__", "spec", "unwrapped", "helper", "library"])
-def test_a_file_reaches_no_method_function_or_module(name):
-    """From any of them a file could reach ``os.system``; what is named like them is not replaced either."""
-    env = ChainEnv()
-    env.helper, env.library = np.zeros, json
-    before = dict(vars(env))
-    for child in (attributes(1, __globals__={":kind:": "dict", ":class:": "dict"}), {":kind:": "plain", "value": 1}):
-        with pytest.raises(ValueError, match=rf"ChainEnv\.{name} must be state of an environment, got a method"):
-            restore(env, attributes(0, **{name: child}))
-    assert vars(env).keys() == before.keys() and all(vars(env)[key] is value for key, value in before.items())
+OS = {":kind:": "object", "module": "os", "name": "system", "attributes": {}}
+FORGED = [
+    ("state", OS),
+    ("state", "text"),
+    ("state", {":kind:": "class", "module": "torch.nn", "name": "Linear"}),
+    ("state", {":kind:": "array", "dtype": "<f8", "shape": [2], "data": "AAAAAAAAAAAAAAAAAAAAAA=="}),
+    ("steps_beyond_terminated", [1]),
+    ("_elapsed_steps", 1.5),
+    ("np_random", {"bit_generator": "PCG64", "state": "x"}),
+    ("np_random", [OS]),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), FORGED, ids=str)
+def test_a_value_of_another_kind_raises(name, value):
+    env = make_vec_env("CartPole-v1", 1)
+    env.reset()
+    before = env.envs[0].unwrapped.state.copy()
+    with pytest.raises(ValueError):
+        restore(env, changed(capture(env)[0], name, value), wrappers_only=False)
+    assert name == "np_random" or (env.envs[0].unwrapped.state == before).all()
+
+
+@pytest.mark.parametrize("name", ["step", "render", "__class__", "__dict__", "spec", "gravity", "reset", "unwrapped"])
+def test_a_file_names_no_other_attribute(name):
+    """From a method, a file could reach ``os.system``."""
+    env = make_vec_env("CartPole-v1", 1)
+    env.reset()
+    state, _ = capture(env)
+    for layer in state["envs"][0]:
+        before = dict(layer[1])
+        layer[1][name] = {":kind:": "dict", "items": []}
+        with pytest.raises(ValueError, match=r"must be restored from \["):
+            restore(env, state, wrappers_only=False)
+        layer[1] = before
+
+
+def test_a_generators_position_outside_its_array_raises():
+    pytest.importorskip("minatar")
+    env = make_vec_env("MinAtar/Breakout-v1", 1)
+    env.reset()
+    state = json.loads(json.dumps(capture(env)[0]))
+    state["envs"][0][-1][1]["game"]["random"]["state"]["pos"] = 10**6
+    with pytest.raises(ValueError, match="pos of a generator must be in 0 to 624, got 1000000"):
+        restore(env, state, wrappers_only=False)
 
 
 def test_bytes_of_an_emulator_are_restored_into_an_emulator_only():
-    class Trap:
-        def cloneSystemState(self):
-            raise AssertionError("was run")
+    pytest.importorskip("ale_py")
+    env = atari(0)
+    env.reset()
+    for text in ("00", "ff" * 300, "zz", os.urandom(3000).hex()):
+        with pytest.raises((ValueError, RuntimeError)):
+            restore(env, changed(capture(env)[0], "ale", text), wrappers_only=False)
 
+
+def test_state_dict_must_be_plain():
     env = ChainEnv()
-    env.trap = Trap()
-    with pytest.raises(ValueError, match=r"ChainEnv\.trap must be an emulator of ale-py, got Trap"):
-        restore(env, attributes(0, trap={":kind:": "emulator", "value": "00"}))
+    env.state_dict = lambda: [ChainEnv()]
+    with pytest.raises(ValueError, match=r"ChainEnv\.state_dict must return numbers, strings, arrays and containers"):
+        capture(make_vec_env(lambda: env, 1))
+
+
+def test_the_table_names_only_known_types():
+    kinds = {kind for row in ATTRIBUTES.values() for entry in row.values() for kind in entry.removesuffix("?").split("/")}
+    assert kinds == {"int", "real", "bool", "array", "list", "tuple", "part"}

@@ -29,8 +29,6 @@ def test_when_a_reset_is_due():
     assert not resets.is_due(11, 9)  # less than a full interval would be left
     resets.done += [10, 25]
     assert not resets.is_due(34, 90) and resets.is_due(35, 90)
-    resets.roll_back(25)
-    assert resets.done == [10] and resets.is_due(20, 90)
     assert not Resets(ResetSchedule()).is_due(10**9, 90)
 
 

@@ -46,16 +46,6 @@ def environment_errors(step: int) -> Iterator[None]:
         ) from error
 
 
-def check_finite(what: str, values: np.ndarray | dict[str, np.ndarray] | None, step: int) -> None:
-    """Raise ValueError if values from the environment contain NaN or infinity; ``what`` describes them, for the message."""
-    found = find_infinite(values)
-    if found is not None:
-        raise ValueError(
-            f"step {step}: {what}s from the environment must be finite, got {found}. "
-            "The step was not stored and the model is unchanged. SB3's VecCheckNan shows which action caused it."
-        )
-
-
 def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | None:
     """
     Return the first NaN or infinity of an array, or of a dictionary of arrays together with its key, or ``None``. Numbers
@@ -70,14 +60,17 @@ def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | No
     return None
 
 
-def check_transition(action_space: spaces.Space, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray) -> None:
-    """Raise ValueError if a transition has an invalid action or a number that is not finite."""
+def check_transition(action_space: spaces.Space, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any) -> None:
+    """Raise ValueError if a transition has an invalid action, a number that is not finite, or an unclear end."""
     for what, values in (("obs", obs), ("next_obs", next_obs), ("reward", reward)):
         if (found := find_infinite(values)) is not None:
             raise ValueError(f"{what} must be finite, got {found}. Nothing was stored.")
     actions, n_actions = np.asarray(action), int(getattr(action_space, "n", 0))
     if n_actions and not ((actions >= 0) & (actions < n_actions)).all():  # NaN is neither
         raise ValueError(f"action must be integers in [0, {n_actions - 1}], got {actions.tolist()}. Nothing was stored.")
+    dones = np.asarray(done)
+    if dones.dtype != bool and not (np.issubdtype(dones.dtype, np.number) and np.isin(dones, (0, 1)).all()):
+        raise ValueError(f"done must be True or False, got {dones.tolist()}. Nothing was stored.")
 
 
 def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewhere: type) -> None:
@@ -190,7 +183,21 @@ def check_policy(owner: str, policy: Any, aliases: dict[str, type], observation_
 
 
 def check_normalization(normalize: VecNormalize | None, observation_space: spaces.Space) -> None:
-    """Raise ValueError if a wrapper outside VecNormalize changes observations: the originals could not be stored."""
+    """
+    Raise ValueError if a wrapper outside VecNormalize changes observations: the originals could not be stored; or if it
+    normalises integers, whose terminal observations SB3 would cut to integers after it has scaled them back.
+    """
+    if normalize is not None and normalize.norm_obs:
+        inside = normalize.venv.observation_space
+        parts = (
+            {key: inside[key] for key in normalize.norm_obs_keys or []} if isinstance(inside, spaces.Dict) else {"": inside}
+        )
+        if integers := [key for key, space in parts.items() if not np.issubdtype(space.dtype, np.floating)]:  # type: ignore[arg-type]
+            of_keys = f" of {', '.join(map(repr, integers))}" if integers != [""] else ""
+            raise ValueError(
+                f"VecNormalize must normalise floats, got integers{of_keys}. Pass norm_obs=False, or norm_obs_keys with the "
+                "other keys of a Dict; or put gymnasium.wrappers.DtypeObservation(env, np.float32) around the environment."
+            )
     if normalize is not None and normalize.observation_space != observation_space:
         raise ValueError(
             f"VecNormalize must be outside all wrappers that change observations, so that it can return the original ones, "

@@ -148,9 +148,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param reward: r_{t+1}
         :param done: whether the episode ended, by a terminal state or a time-out
         :param infos: one dict per environment; ``TimeLimit.truncated`` marks a time-out
-        :raises ValueError: if an action is out of range or a number is not finite; nothing is stored in this case
+        :raises ValueError: if an action is out of range, a number is not finite or ``done`` is neither true nor false; nothing
+            is stored in this case
         """
-        check_transition(self.action_space, obs, next_obs, action, reward)
+        check_transition(self.action_space, obs, next_obs, action, reward, done)
         follows = np.ones(self.n_envs, dtype=bool)
         for key, store in self._stores.items():
             now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))

@@ -13,16 +13,17 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_eqr.common.checks.arguments import ALGORITHM, check, integer
-from sb3_eqr.common.saving.env_state import CLASS, NUMBER, MissingObjectError, capture, restore
+from sb3_eqr.common.saving.env_state import capture, restore
 from sb3_eqr.common.saving.files import atomic_folder, checksum, remove_leftovers
-from sb3_eqr.common.saving.plain_data import KIND, decode, encode
+from sb3_eqr.common.saving.plain_data import decode, encode, without_pickles
 from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 
 PREFIX = "checkpoint-"  # followed by the step
-MANIFEST, MODEL, BUFFER, ENVIRONMENT = "manifest.json", "model.zip", "replay_buffer.pkl", "environment.json"
+MANIFEST, MODEL, BUFFER = "manifest.json", "model.zip", "replay_buffer.pkl"
+LARGEST_MANIFEST = 100 << 20  # bytes; Monitor keeps three numbers for each episode, 60 MB for a million
 
 
 def write_checkpoint(
@@ -47,13 +48,13 @@ def write_checkpoint(
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
             model.save_replay_buffer(partial / BUFFER)
-        state, hidden = capture(env)
-        (partial / ENVIRONMENT).write_text(json.dumps(state), encoding="utf-8")
+        state, unknown = capture(env)
         manifest = {
             "algorithm": type(model).__name__,
             "num_timesteps": model.num_timesteps,
             "settings": settings_of(model),
-            "hidden": hidden,  # state of the environment that cannot be restored
+            "environment": state,
+            "unknown": unknown,  # classes of the environment whose state cannot be restored
             "rng": encode(get_rng_state(model.action_space)),
             "notes": encode(notes),
             "sha256": {path.name: checksum_of(path) for path in sorted(partial.iterdir())},
@@ -75,30 +76,23 @@ def discard(checkpoint: pathlib.Path) -> None:
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
     """The arguments of an agent, its spaces and its environment as plain data, to distinguish its run from others."""
     names = [name for name in ALGORITHM if name not in ("verbose", "tensorboard_log", "device")]
-    found = {name: _without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
+    found = {name: without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
     spaces = {"observation_space": repr(model.observation_space), "action_space": repr(model.action_space)}
-    return {**found, "resets": encode(getattr(model, "resets", None)), **spaces, "environment": environment_name(model)}
+    return {**found, "resets": encode(getattr(model, "resets", None)), **spaces, "environment": environment_of(model)}
 
 
-def environment_name(model: BaseAlgorithm) -> str | None:
+def environment_of(model: BaseAlgorithm) -> dict[str, Any]:
     """
-    The first environment's id at gymnasium, or the name of its class; ``None`` where it is in another process, which would
-    have to pickle it.
+    What the first environment was made with: its id at gymnasium, or the name of its class, and gymnasium's arguments. Empty
+    where it is in another process, which would have to pickle it.
     """
     innermost = None if model.env is None else model.env.unwrapped
     if not isinstance(innermost, DummyVecEnv):
-        return None
-    env = innermost.envs[0].unwrapped
-    return type(env).__name__ if env.spec is None else env.spec.id
-
-
-def _without_pickles(value: Any) -> Any:
-    """Encoded data with the types of pickled objects in place of their pickles, which differ from process to process."""
-    if isinstance(value, list):
-        return [_without_pickles(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    return value["type"] if value.get(KIND) == "pickle" else {key: _without_pickles(item) for key, item in value.items()}
+        return {}
+    env, spec = innermost.envs[0].unwrapped, innermost.envs[0].spec
+    if spec is None:
+        return {"id": type(env).__name__}
+    return {"id": spec.id, "max_episode_steps": spec.max_episode_steps, "kwargs": without_pickles(encode(spec.kwargs))}
 
 
 @contextmanager
@@ -141,52 +135,43 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
             f"{path} must be a checkpoint or a folder with checkpoints, got {'neither' if path.exists() else 'nothing'}."
         )
     try:
+        if (found / MANIFEST).stat().st_size > LARGEST_MANIFEST:
+            raise ValueError(f"a manifest above {LARGEST_MANIFEST} bytes")
         manifest = json.loads((found / MANIFEST).read_text(encoding="utf-8"))
         changed = [MANIFEST] if manifest.pop("digest") != digest(manifest) else []
         changed += [name for name, expected in manifest["sha256"].items() if checksum_of(found / name) != expected]
-    except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError, RecursionError) as error:
         raise ValueError(f"{found} must be a complete checkpoint, got {error!r}. Use an earlier one.") from error
     if changed:
         raise ValueError(f"{found} must be unchanged, got changes in {', '.join(changed)}. Use an earlier checkpoint.")
     return found, manifest
 
 
-def restore_environment(model: BaseAlgorithm, checkpoint: pathlib.Path, manifest: dict[str, Any], wrappers_only: bool) -> bool:
+def restore_environment(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) -> None:
     """
-    Restore the state of an environment that is built like that of the checkpoint. If a part of it cannot be restored, only the
-    state of its vectorised wrappers is, such as the statistics of VecNormalize, and the agent begins a new episode. Its seed
+    Restore the state of environments that are built like those of the checkpoint. If it is not known completely, only that of
+    the vectorised wrappers is restored, such as the statistics of VecNormalize, and the agent begins a new episode. Its seed
     depends on the step, so that the run's first episodes are not played again.
 
-    :param model: the loaded agent, with its environment
-    :param checkpoint: the checkpoint
-    :param manifest: its manifest; what is found to be missing is added to its "hidden"
-    :param wrappers_only: whether to restore the wrappers only
-    :return: whether all was restored
+    :param model: the loaded agent, with its environments
+    :param manifest: from :func:`read_manifest`
+    :param is_exact: whether to restore everything
+    :raises ValueError: if the environments are built differently
     """
     env = model.get_env()
     assert env is not None
-    if not wrappers_only:
-        try:
-            _restore(env, checkpoint, wrappers_only=False)
-            return True
-        except MissingObjectError as error:
-            manifest["hidden"].append(error.path)
-    _restore(env, checkpoint, wrappers_only=True)
-    model._last_obs = None  # so that learn resets the environment
-    env.seed(None if model.seed is None else model.seed + model.num_timesteps)
-    return False
-
-
-def _restore(env: VecEnv, checkpoint: pathlib.Path, wrappers_only: bool) -> None:
+    theirs, ours = manifest["settings"]["environment"], environment_of(model)
+    differs = [name for name in theirs if name in ours and theirs[name] != ours[name]]
+    named = ", ".join(f"{name} = {theirs[name]!r} there, {ours[name]!r} here" for name in differs)
+    if "id" in differs:
+        raise ValueError(f"env must be the environment of the original run, got another one ({named}).")
+    if differs:
+        warnings.warn(f"The run continues in an environment with other arguments than before: {named}.")
     env.reset()  # some environments create their attributes only here
-    state = json.loads((checkpoint / ENVIRONMENT).read_text(encoding="utf-8"))
-    innermost = state
-    while innermost.get("venv") is not None:
-        innermost = innermost["venv"]
-    if wrappers_only:
-        for name in set(innermost) - {KIND, CLASS, NUMBER}:
-            del innermost[name]
-    restore(env, state)
+    restore(env, manifest["environment"], wrappers_only=not is_exact)
+    if not is_exact:
+        model._last_obs = None  # so that learn resets the environment
+        env.seed(None if model.seed is None else model.seed + model.num_timesteps)
 
 
 def restore_generators(model: BaseAlgorithm, manifest: dict[str, Any]) -> None:
@@ -194,11 +179,12 @@ def restore_generators(model: BaseAlgorithm, manifest: dict[str, Any]) -> None:
     set_rng_state(decode(manifest["rng"]), model.action_space)
 
 
-def warn_of_hidden(checkpoint: pathlib.Path, manifest: dict[str, Any]) -> None:
+def warn_of_unknown(checkpoint: pathlib.Path, manifest: dict[str, Any]) -> None:
     """Warn that a run is not resumed exactly."""
     warnings.warn(
-        f"{checkpoint}: part of the environment's state cannot be saved ({', '.join(manifest['hidden'][:3])}), "
-        "so training resumes with new episodes and does not continue bit for bit."
+        f"{checkpoint}: the state of {', '.join(manifest['unknown'][:3])} is not known, so training resumes with new "
+        "episodes, and does not continue bit for bit. Give the class state_dict and load_state_dict; in other processes, make "
+        "the environments with wrapper_class=sb3_eqr.envs.ResumableWrapper."
     )
 
 
@@ -225,6 +211,7 @@ class ExactCheckpointCallback(BaseCallback):
         self.save_path = pathlib.Path(save_path)
         self.keep = keep
         self._last = 0
+        self._is_called = False  # at the start of rollouts
 
     def _on_training_start(self) -> None:
         self._last = self.num_timesteps // self.save_freq
@@ -256,6 +243,7 @@ class ExactCheckpointCallback(BaseCallback):
             )
 
     def _on_rollout_start(self) -> None:
+        self._is_called = True
         if self.model.num_timesteps // self.save_freq > self._last:
             self._last = self.model.num_timesteps // self.save_freq
             checkpoint = write_checkpoint(self.save_path, self.model, keep=self.keep)
@@ -263,4 +251,9 @@ class ExactCheckpointCallback(BaseCallback):
                 print(f"Saving a checkpoint to {checkpoint}")
 
     def _on_step(self) -> bool:
+        if not self._is_called:
+            raise ValueError(
+                "ExactCheckpointCallback must be given to learn itself, alone or in a list, got it inside another callback, "
+                "which calls it in the middle of a step. Choose save_freq instead."
+            )
         return True

@@ -1,309 +1,273 @@
 """
-Capturing the state of environments as plain data, and restoring it into environments that were built alike. Restoring creates
-arrays and containers, but no other objects, and executes no code of the file. What cannot be captured is named.
+The state of environments as plain data: only the attributes that the table names, each of its type. A file holds values for
+them and names nothing; parameters of an environment, such as its time limit, belong to the one that the user passes.
 """
 
-import enum
-import functools
-import inspect
-import io
-import logging
-import random
-import types
-from collections import Counter, OrderedDict, defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
-import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import VecEnv
+from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_eqr.common.saving.plain_data import KIND, decode, encode
+from sb3_eqr.common.saving.plain_data import decode, encode, without_pickles
 
-# Values that are not captured: definitions, and handles to the outside such as loggers.
-FIXED: tuple[type, ...] = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType)
-FIXED += (functools.partial, np.ufunc, np.dtype, logging.Logger, ResultsWriter)
-SKIPPED = ("spec", "_cached_spec", "metadata", "class_attributes")
-PLAIN = (bool, int, float, str, bytes)
-UNCHANGING: dict[str, Any] = {"tuple": tuple, "frozenset": frozenset, "set": set}  # or not able to contain themselves
-DICTS: dict[str, Any] = {"dict": dict, "OrderedDict": OrderedDict, "Counter": Counter}
-CLASS = ":class:"  # key of the name of an object's class
-NUMBER = ":number:"  # key of the number of an object, in the order in which objects are encountered
-WRAPPED = ("env", "venv", "envs")  # attributes that hold the environment that a wrapper wraps
-STATELESS = type("Stateless", (), {})  # the size of its instances is that of objects that consist of their attributes
-
-
-class MissingObjectError(ValueError):
-    """An environment created an object during the run, which a new one does not have. ``path``: where it was."""
-
-    def __init__(self, path: str):
-        super().__init__(f"{path} must be the original object, got another or none: the run created it, or moved it there.")
-        self.path = path
-
-
-def capture(root: Any) -> tuple[Any, list[str]]:
-    """
-    :param root: an environment, vectorised or not, with all its wrappers
-    :return: its state as JSON, and the paths of objects whose state is not accessible from Python, such as a physics engine;
-        empty if the state is complete
-    """
-    search = _Capture()
-    return search.captured(root, ""), search.hidden
-
-
-def restore(root: Any, state: Any) -> None:
-    """
-    :param root: an environment built like the captured one
-    :param state: state returned by :func:`capture`
-    :raises ValueError: if the environment was built differently
-    :raises MissingObjectError: if it was built in the same way, but later created an object; the state is restored in part
-    """
-    if NUMBER not in state:
-        raise ValueError("The checkpoint must be one of this version of the package, got an earlier one. Start the run again.")
-    _Restoring().restored(root, state, type(root).__name__)
-
-
-class _Capture:
-    """``hidden``: paths of what cannot be captured."""
-
-    def __init__(self) -> None:
-        self.hidden: list[str] = []
-        self._seen: dict[int, int] = {}  # id of an object -> its number
-        self._memory: dict[int, dict[str, Any]] = {}  # id of the owner of an array's memory -> state of the first such array
-
-    def captured(self, value: Any, path: str) -> Any:
-        if value is None or type(value) in PLAIN or isinstance(value, np.generic):
-            is_bytes = isinstance(value, bytes)
-            return {KIND: "bytes", "value": value.hex()} if is_bytes else {KIND: "plain", "value": encode(value)}
-        if isinstance(value, enum.Enum):
-            return {KIND: "member", "name": value.name}
-        if isinstance(value, FIXED):
-            return None
-        if id(value) in self._seen:  # an object is captured where it is first encountered
-            return {KIND: "same", NUMBER: self._seen[id(value)]}
-        number = self._seen[id(value)] = len(self._seen)
-        found = self._captured_object(value, path)
-        if found is not None:
-            found[NUMBER] = number
-        return found
-
-    def _captured_object(self, value: Any, path: str) -> Any:
-        kind = type(value)
-        if kind is np.ndarray and value.dtype != object:
-            return self._captured_array(value)
-        if isinstance(value, th.Tensor):
-            return {KIND: "tensor", "value": encode(value.detach().cpu().numpy())}
-        if kind is random.Random:
-            return {KIND: "generator", "value": encode(value.getstate())}
-        if isinstance(value, (np.random.Generator, np.random.RandomState)):
-            state: Any = value.bit_generator.state if isinstance(value, np.random.Generator) else value.get_state()
-            return {KIND: "generator", "value": encode(state)}
-        if isinstance(value, spaces.Space):  # samples are drawn with their own generators
-            drawn = [space._np_random for space in _parts(value)]
-            return {KIND: "space", "value": encode([None if rng is None else rng.bit_generator.state for rng in drawn])}
-        if hasattr(value, "cloneSystemState"):
-            return {KIND: "emulator", "value": value.cloneSystemState().serialize().hex()}
-        if isinstance(value, io.IOBase) and (value.closed or not value.readable()):
-            return None
-        return self._captured_container(value, path) or self._captured_attributes(value, path)
-
-    def _captured_array(self, value: np.ndarray) -> dict[str, Any]:
-        state = {KIND: "array", "value": encode(value), "is_shared": False}
-        owner: Any = value
-        while isinstance(owner, np.ndarray) and owner.base is not None:
-            owner = owner.base
-        first = self._memory.setdefault(id(owner), state)
-        if first is not state:  # the new environment's arrays share memory in the same way
-            first["is_shared"] = state["is_shared"] = True
-        return state
-
-    def _captured_container(self, value: Any, path: str) -> Any:
-        kind = type(value)
-        if kind in (set, frozenset) and all(map(_is_plain_key, value)):
-            return {KIND: "list", CLASS: kind.__name__, "items": [self.captured(item, path) for item in value]}
-        if kind in (list, tuple, deque) or (isinstance(value, tuple) and hasattr(value, "_fields")):
-            items = [self.captured(item, f"{path}[{i}]") for i, item in enumerate(value)]
-            maxlen = {"maxlen": value.maxlen} if kind is deque else {}
-            return {KIND: "list", CLASS: kind.__name__, "items": items, **maxlen}
-        if kind in (*DICTS.values(), defaultdict) and all(map(_is_plain_key, value)):
-            items = [self.captured(item, f"{path}[{key!r}]") for key, item in value.items()]
-            return {KIND: "dict", CLASS: kind.__name__, "keys": [encode(key) for key in value], "items": items}
-        return None
-
-    def _captured_attributes(self, value: Any, path: str) -> Any:
-        kind = type(value)
-        is_larger = kind.__basicsize__ > STATELESS.__basicsize__ or kind.__itemsize__ > 0
-        if not hasattr(value, "__dict__") or is_larger or any(vars(base).get("__slots__") for base in kind.__mro__):
-            self.hidden.append(path)  # it has state that is not in its attributes
-            return None
-        children = {name: child for name, child in vars(value).items() if name not in SKIPPED}
-        named = {CLASS: kind.__name__} if isinstance(value, VecEnv) else {}  # gymnasium's wrappers may be substituted
-        found = {name: self.captured(child, f"{path}.{name}") for name, child in children.items()}
-        return {KIND: "attributes", **named, **found}
-
-
-def _own_value(current: Any, name: str, path: str, state: Any) -> Any:
-    """
-    The value of an attribute that a file names. Only what the object itself holds is looked up: from its methods, a file could
-    reach every module of the process. Nothing that would shadow a method or a property is restored.
-
-    :raises ValueError: if the file names anything else
-    """
-    of_class = inspect.getattr_static(type(current), name, None)
-    is_defined = callable(of_class) or hasattr(of_class, "__get__")
-    found = vars(current).get(name, None if is_defined else of_class)
-    shadows = name not in vars(current) and is_defined
-    if name in SKIPPED or (name.startswith("__") and name.endswith("__")) or shadows or (isinstance(found, FIXED) and state):
-        raise ValueError(f"{path} must be state of an environment, got a method, a function or a module. Nothing was run.")
-    return found
-
-
-def _is_plain_key(key: Any) -> bool:
-    return key is None or type(key) in (bool, int, float, str) or (type(key) is tuple and all(map(_is_plain_key, key)))
-
-
-def _parts(space: spaces.Space) -> Iterator[spaces.Space]:
-    """A space, and the spaces that it consists of."""
-    yield space
-    inside = getattr(space, "spaces", ())
-    for part in inside.values() if isinstance(inside, dict) else inside:
-        yield from _parts(part)
-
-
-class _Restoring:
-    def __init__(self) -> None:
-        self._objects: dict[int, Any] = {}  # number -> restored object
-        self._updated: dict[int, Any] = {}  # id -> object that was updated in place
-
-    def restored(self, current: Any, state: Any, path: str) -> Any:
-        """The restored value for ``current``; objects that consist of attributes are updated in place."""
-        if state is None:
-            return current
-        if state[KIND] == "same":
-            return self._objects.get(state[NUMBER], current)
-        found = HANDLERS[state[KIND]](self, current, state, path)
-        if NUMBER in state:
-            self._objects[state[NUMBER]] = found
-        return found
-
-    def _claimed(self, current: Any, path: str) -> Any:
-        """An object to update, which must not be one that was already updated with the state of another object."""
-        if current is None or isinstance(current, FIXED) or id(current) in self._updated:
-            raise MissingObjectError(path)
-        self._updated[id(current)] = current
-        return current
-
-    def _plain(self, current: Any, state: Any, path: str) -> Any:
-        return decode(state["value"])
-
-    def _bytes(self, current: Any, state: Any, path: str) -> bytes:
-        return bytes.fromhex(state["value"])
-
-    def _member(self, current: Any, state: Any, path: str) -> enum.Enum:
-        if not isinstance(current, enum.Enum) or state["name"] not in type(current).__members__:
-            raise MissingObjectError(path)
-        return type(current)[state["name"]]
-
-    def _array(self, current: Any, state: Any, path: str) -> np.ndarray:
-        found = decode(state["value"])
-        if not state["is_shared"]:
-            return found  # the current one may be a constant
-        if not isinstance(current, np.ndarray) or (current.shape, current.dtype) != (found.shape, found.dtype):
-            raise MissingObjectError(path)
-        if current.flags.writeable:
-            current[...] = found
-        return current
-
-    def _tensor(self, current: Any, state: Any, path: str) -> th.Tensor:
-        found = th.from_numpy(decode(state["value"]))
-        if not isinstance(current, th.nn.Parameter):
-            return found.to(current.device) if isinstance(current, th.Tensor) else found
-        with th.no_grad():
-            return current.copy_(found)
-
-    def _generator(self, current: Any, state: Any, path: str) -> Any:
-        self._claimed(current, path)
-        if isinstance(current, random.Random):
-            current.setstate(decode(state["value"]))
-        elif isinstance(current, np.random.RandomState):
-            current.set_state(decode(state["value"]))
-        else:
-            current.bit_generator.state = decode(state["value"])
-        return current
-
-    def _space(self, current: Any, state: Any, path: str) -> Any:
-        if not isinstance(current, spaces.Space):
-            raise MissingObjectError(path)
-        for space, rng in zip(_parts(current), decode(state["value"]), strict=False):
-            if rng is not None:
-                space.np_random.bit_generator.state = rng
-        return current
-
-    def _emulator(self, current: Any, state: Any, path: str) -> Any:
-        if type(current).__name__ != "ALEInterface" or not type(current).__module__.startswith("ale_py"):
-            raise ValueError(f"{path} must be an emulator of ale-py, got {type(current).__name__}. Nothing was run.")
-        kind = type(self._claimed(current, path).cloneSystemState())
-        current.restoreSystemState(kind(bytes.fromhex(state["value"])))
-        return current
-
-    def _attributes(self, current: Any, state: Any, path: str) -> Any:
-        found, expected = type(current).__name__, state.get(CLASS)
-        is_wrapper = expected is not None or path.rpartition(".")[2].partition("[")[0] in WRAPPED
-        if is_wrapper and (current is None or (expected is not None and found != expected)):
-            raise ValueError(
-                f"{path} must be {'an object' if expected is None else f'a {expected}'}, "
-                f"got {'nothing' if current is None else found}: the environment is not built as in the original run. "
-                "Pass one with the same wrappers, including VecNormalize."
-            )
-        self._objects[state[NUMBER]] = self._claimed(current, path)  # its attributes may refer to it
-        for name, child in state.items():
-            if name in (KIND, CLASS, NUMBER) or (child is None and name not in vars(current)):
-                continue
-            old = _own_value(current, name, f"{path}.{name}", child)
-            vars(current)[name] = self.restored(old, child, f"{path}.{name}")  # some objects refuse setattr
-        return current
-
-    def _list(self, current: Any, state: Any, path: str) -> Any:
-        name, items = state[CLASS], state["items"]
-        old = list(current) if isinstance(current, (list, tuple, deque)) else []
-        old += [None] * (len(items) - len(old))
-        found: list[Any] = []
-        if name == "list":
-            self._objects[state[NUMBER]] = found  # it may contain itself
-        found += [self.restored(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, items, strict=False))]
-        if name == "list":
-            return found
-        if name in UNCHANGING:
-            return UNCHANGING[name](found)
-        if name == "deque":
-            return deque(found, state["maxlen"])
-        if type(current).__name__ != name or not isinstance(current, tuple) or not hasattr(current, "_fields"):
-            raise MissingObjectError(path)
-        return type(current)(*found)  # a named tuple
-
-    def _dict(self, current: Any, state: Any, path: str) -> Any:
-        name, old = state[CLASS], current if isinstance(current, dict) else {}
-        if name == "defaultdict" and not isinstance(current, defaultdict):
-            raise MissingObjectError(path)
-        found = defaultdict(current.default_factory) if name == "defaultdict" else DICTS[name]()
-        self._objects[state[NUMBER]] = found  # it may contain itself
-        for key, child in zip(map(decode, state["keys"]), state["items"], strict=True):
-            found[key] = self.restored(dict.get(old, key), child, f"{path}[{key!r}]")
-        return found
-
-
-HANDLERS: dict[str, Callable[[_Restoring, Any, Any, str], Any]] = {
-    "plain": _Restoring._plain,
-    "bytes": _Restoring._bytes,
-    "member": _Restoring._member,
-    "array": _Restoring._array,
-    "tensor": _Restoring._tensor,
-    "generator": _Restoring._generator,
-    "space": _Restoring._space,
-    "emulator": _Restoring._emulator,
-    "list": _Restoring._list,
-    "dict": _Restoring._dict,
-    "attributes": _Restoring._attributes,
+# One line per class: its attributes, each with its type. "?" allows None; a "part" is a generator, an emulator, or an object
+# with a line of its own, and is updated in place. np_random of an environment is always restored.
+TABLE = """
+stable_baselines3.common.monitor.Monitor rewards:list needs_reset:bool episode_returns:list episode_lengths:list \
+    episode_times:list total_steps:int t_start:real
+stable_baselines3.common.atari_wrappers.NoopResetEnv
+stable_baselines3.common.atari_wrappers.FireResetEnv
+stable_baselines3.common.atari_wrappers.ClipRewardEnv
+stable_baselines3.common.atari_wrappers.WarpFrame
+stable_baselines3.common.atari_wrappers.AtariWrapper
+stable_baselines3.common.atari_wrappers.StickyActionEnv _sticky_action:int
+stable_baselines3.common.atari_wrappers.EpisodicLifeEnv lives:int was_real_done:bool
+stable_baselines3.common.atari_wrappers.MaxAndSkipEnv _obs_buffer:array
+stable_baselines3.common.vec_env.vec_normalize.VecNormalize obs_rms:part ret_rms:part returns:array
+stable_baselines3.common.running_mean_std.RunningMeanStd mean:array/real var:array/real count:real
+stable_baselines3.common.vec_env.vec_frame_stack.VecFrameStack stacked_obs:part
+stable_baselines3.common.vec_env.stacked_observations.StackedObservations stacked_obs:array sub_stacked_observations:part
+stable_baselines3.common.vec_env.vec_monitor.VecMonitor episode_count:int t_start:real episode_returns:array \
+    episode_lengths:array
+stable_baselines3.common.vec_env.vec_transpose.VecTransposeImage
+stable_baselines3.common.vec_env.vec_check_nan.VecCheckNan
+stable_baselines3.common.vec_env.vec_extract_dict_obs.VecExtractDictObs
+gymnasium.wrappers.common.PassiveEnvChecker
+gymnasium.wrappers.common.OrderEnforcing
+gymnasium.wrappers.common.TimeLimit _elapsed_steps:int?
+gymnasium.wrappers.common.RecordEpisodeStatistics episode_count:int episode_returns:real episode_lengths:int
+gymnasium.wrappers.stateful_observation.TimeAwareObservation timesteps:int
+gymnasium.wrappers.stateful_observation.MaxAndSkipObservation _obs_buffer:array
+gymnasium.wrappers.atari_preprocessing.AtariPreprocessing lives:int game_over:bool obs_buffer:list
+gymnasium.wrappers.transform_observation.FlattenObservation
+gymnasium.wrappers.transform_observation.GrayscaleObservation
+gymnasium.wrappers.transform_observation.ResizeObservation
+gymnasium.wrappers.transform_observation.RescaleObservation
+gymnasium.wrappers.transform_observation.DtypeObservation
+gymnasium.wrappers.transform_action.ClipAction
+gymnasium.wrappers.transform_action.RescaleAction
+gymnasium.wrappers.transform_reward.ClipReward
+gymnasium.envs.classic_control.cartpole.CartPoleEnv state:array? steps_beyond_terminated:int?
+gymnasium.envs.classic_control.mountain_car.MountainCarEnv state:array/tuple
+gymnasium.envs.classic_control.continuous_mountain_car.Continuous_MountainCarEnv state:array
+gymnasium.envs.classic_control.acrobot.AcrobotEnv state:array/list?
+gymnasium.envs.classic_control.pendulum.PendulumEnv state:array? last_u:array/real?
+gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv s:int lastaction:int?
+gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv s:int lastaction:int?
+gymnasium.envs.toy_text.taxi.TaxiEnv s:int lastaction:int? fickle_step:bool
+ale_py.env.AtariEnv ale:part
+minatar.gym.BaseEnv game:part
+minatar.environment.Environment random:part env:part last_action:int
+minatar.environments.asterix.Env random:part player_x:int player_y:int entities:list shot_timer:int spawn_speed:int \
+    spawn_timer:int move_speed:int move_timer:int ramp_timer:int ramp_index:int terminal:bool
+minatar.environments.breakout.Env random:part ball_y:int ball_x:int ball_dir:int pos:int brick_map:array strike:bool \
+    last_x:int last_y:int terminal:bool
+minatar.environments.freeway.Env random:part cars:list pos:int move_timer:int terminate_timer:int terminal:bool
+minatar.environments.seaquest.Env random:part oxygen:int diver_count:int sub_x:int sub_y:int sub_or:bool f_bullets:list \
+    e_bullets:list e_fish:list e_subs:list divers:list e_spawn_speed:int e_spawn_timer:int d_spawn_timer:int move_speed:int \
+    ramp_index:int shot_timer:int surface:bool terminal:bool
+minatar.environments.space_invaders.Env random:part pos:int f_bullet_map:array e_bullet_map:array alien_map:array \
+    alien_dir:int enemy_move_interval:int alien_move_timer:int alien_shot_timer:int ramp_index:int shot_timer:int terminal:bool
+sb3_eqr.envs.atari.Atari100kWrapper
+sb3_eqr.envs.minatar.ChannelsFirstImage
+sb3_eqr.envs.blind_cliffwalk.BlindCliffwalk state:int
+sb3_eqr.envs.sliding_ball.SlidingBall _start:array _moved:array _distractors:array
+sb3_eqr.envs.pixel_pendulum.PixelPendulum angle:real velocity:real
+sb3_eqr.envs.star_field.StarField rotation:array translation:array
+"""
+TYPES: dict[str, tuple[type, ...]] = {
+    "int": (int, np.integer),
+    "real": (int, float, np.integer, np.floating),
+    "bool": (bool, np.bool_),
+    "array": (np.ndarray,),
+    "list": (list,),
+    "tuple": (tuple,),
+    "part": (),
 }
+ATTRIBUTES = {
+    name: dict(entry.split(":") for entry in entries)
+    for name, *entries in map(str.split, TABLE.replace("\\\n", "").strip().split("\n"))
+}
+
+
+class ResumableWrapper(gym.Wrapper, RecordConstructorArgs):
+    """
+    Lets a run in other processes be resumed bit for bit, as the outermost wrapper of each environment:
+    ``make_vec_env(..., vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)``.
+    """
+
+    def __init__(self, env: gym.Env):
+        RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+
+    def captured(self) -> list[Any]:
+        """:return: the state of this environment"""
+        return _captured_env(self.env)
+
+    def restore(self, state: list[Any]) -> None:
+        """:param state: returned by :meth:`captured`"""
+        _restore_env(self.env, state)
+
+
+def capture(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
+    """
+    :param env: environments with all their wrappers
+    :return: their state as JSON, and the names of the classes whose state is not known; empty if the state is complete
+    """
+    wrappers, innermost = _split(env)
+    parts: list[Any] = [[_name(wrapper), _state_of(wrapper)] for wrapper in wrappers]
+    if isinstance(innermost, DummyVecEnv):
+        envs = [_captured_env(one) for one in innermost.envs]
+    elif isinstance(innermost, SubprocVecEnv) and innermost.has_attr("captured"):
+        envs = innermost.env_method("captured")
+    else:
+        envs = [[[_name(innermost), None]]]
+    unknown = [name for name, state in [*parts, *(part for one in envs for part in one)] if state is None]
+    return {"wrappers": parts, "innermost": _name(innermost), "envs": envs}, list(dict.fromkeys(unknown))
+
+
+def restore(env: VecEnv, state: dict[str, Any], wrappers_only: bool) -> None:
+    """
+    :param env: environments built like the captured ones, after a reset
+    :param state: returned by :func:`capture`
+    :param wrappers_only: whether to restore the state of the vectorised wrappers only, such as the statistics of VecNormalize
+    :raises ValueError: if the environments are built differently, or a value has not the type or shape of the one it replaces
+    """
+    wrappers, innermost = _split(env)
+    try:
+        expected = [*(name for name, _ in state["wrappers"]), state["innermost"]]
+        _check_built(expected, [_name(part) for part in [*wrappers, innermost]])
+        for wrapper, (_, found) in zip(wrappers, state["wrappers"], strict=True):
+            _restore(wrapper, found)
+        if wrappers_only:
+            return
+        if len(state["envs"]) != innermost.num_envs:
+            raise ValueError(f"n_envs must be {len(state['envs'])}, as in the original run, got {innermost.num_envs}.")
+        for i, found in enumerate(state["envs"]):
+            if isinstance(innermost, DummyVecEnv):
+                _restore_env(innermost.envs[i], found)
+            else:
+                innermost.env_method("restore", found, indices=i)
+    except (KeyError, TypeError, AttributeError, OverflowError, RuntimeError, SystemError) as error:
+        raise ValueError(f"The environment's state must be one written by a checkpoint, got {error!r}.") from error
+
+
+def _split(env: VecEnv) -> tuple[list[VecEnvWrapper], VecEnv]:
+    wrappers = []
+    while isinstance(env, VecEnvWrapper):
+        wrappers.append(env)
+        env = env.venv
+    return wrappers, env
+
+
+def _layers(env: gym.Env) -> Iterator[gym.Env]:
+    """An environment's wrappers from the outside, and the environment itself."""
+    yield env
+    while isinstance(env, gym.Wrapper):
+        env = env.env
+        yield env
+
+
+def _captured_env(env: gym.Env) -> list[Any]:
+    return [[_name(layer), _state_of(layer)] for layer in _layers(env) if not isinstance(layer, ResumableWrapper)]
+
+
+def _restore_env(env: gym.Env, state: list[Any]) -> None:
+    layers = [layer for layer in _layers(env) if not isinstance(layer, ResumableWrapper)]
+    _check_built([name for name, _ in state], [_name(layer) for layer in layers])
+    for layer, (_, found) in zip(layers, state, strict=True):
+        _restore(layer, found)
+
+
+def _check_built(expected: list[str], found: list[str]) -> None:
+    if expected != found:
+        first, other = (" in ".join(name.rpartition(".")[2] for name in names) for names in (expected, found))
+        raise ValueError(
+            f"env must be {first}, got {other}: the environment is not built as in the original run. "
+            "Pass one with the same wrappers, including VecNormalize."
+        )
+
+
+def _name(part: Any) -> str:
+    name = f"{type(part).__module__}.{type(part).__qualname__}"
+    return name.replace("rl_zoo3.gym_patches.PatchedTimeLimit", "gymnasium.wrappers.common.TimeLimit")  # RL Zoo substitutes it
+
+
+def _row(part: Any) -> dict[str, str] | None:
+    row = ATTRIBUTES.get(_name(part))
+    is_env = isinstance(part, gym.Env) and not isinstance(part, gym.Wrapper)
+    return {**row, "np_random": "part"} if row is not None and is_env else row
+
+
+def _state_of(part: Any) -> Any:
+    """The state of one wrapper, environment or part of it as JSON; ``None`` if it is not known."""
+    if (row := _row(part)) is not None:
+        return {name: _value_of(getattr(part, name), kind) for name, kind in row.items() if hasattr(part, name)}
+    if callable(getattr(part, "state_dict", None)) and callable(getattr(part, "load_state_dict", None)):
+        state = encode(part.state_dict())
+        if without_pickles(state) != state:
+            raise ValueError(f"{_name(part)}.state_dict must return numbers, strings, arrays and containers of these.")
+        return state
+    return None
+
+
+def _value_of(value: Any, kind: str) -> Any:
+    if kind != "part":
+        return encode(value)
+    if isinstance(value, np.random.Generator):
+        return encode(value.bit_generator.state)
+    if isinstance(value, np.random.RandomState):
+        return encode(value.get_state(legacy=False))
+    if type(value).__name__ == "ALEInterface":
+        return value.cloneSystemState().serialize().hex()
+    if isinstance(value, dict):
+        return {key: _value_of(item, "part") for key, item in value.items()}
+    return _state_of(value)
+
+
+def _restore(part: Any, state: Any) -> None:
+    """Restore what :func:`_state_of` returned."""
+    row = _row(part)
+    if row is None:
+        part.load_state_dict(decode(state))
+        return
+    if set(state) - set(row):
+        raise ValueError(f"{_name(part)} must be restored from {sorted(row)}, got {sorted(set(state) - set(row))}.")
+    for name, value in state.items():
+        current = getattr(part, name)
+        if row[name] == "part":
+            _restore_part(current, value)
+        else:
+            setattr(part, name, _checked(f"{_name(part)}.{name}", decode(value), row[name], current))
+
+
+def _restore_part(part: Any, state: Any) -> None:
+    """Update an object in place. What is done with the state depends on the object alone, never on the file."""
+    if isinstance(part, np.random.Generator):
+        part.bit_generator.state = decode(state)
+    elif isinstance(part, np.random.RandomState):
+        found = decode(state)
+        if not 0 <= found["state"]["pos"] <= 624:  # NumPy does not check it, and reads beyond its array
+            raise ValueError(f"pos of a generator must be in 0 to 624, got {found['state']['pos']}.")
+        part.set_state(found)
+    elif type(part).__module__.startswith("ale_py") and type(part).__name__ == "ALEInterface":
+        part.restoreSystemState(type(part.cloneSystemState())(bytes.fromhex(state)))
+    elif isinstance(part, dict):
+        for key in part:
+            _restore_part(part[key], state[key])
+    else:
+        _restore(part, state)
+
+
+def _checked(path: str, value: Any, kinds: str, current: Any) -> Any:
+    """A decoded value of a declared type; an array has the shape and dtype of the current one."""
+    legal = [kind for name in kinds.removesuffix("?").split("/") for kind in TYPES[name]] + [type(None)] * kinds.endswith("?")
+    is_legal = isinstance(value, tuple(legal))
+    if isinstance(value, np.ndarray) and isinstance(current, np.ndarray):
+        is_legal &= (value.shape, value.dtype) == (current.shape, current.dtype)
+    if not is_legal:
+        raise ValueError(f"{path} must be like the current {type(current).__name__}, got {value!r:.80}.")
+    return value

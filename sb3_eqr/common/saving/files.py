@@ -22,6 +22,7 @@ except ImportError:  # Windows: it does not rename what is open, so nothing is l
     fcntl = None  # type: ignore[assignment]
 
 
+LONGEST = 200  # bytes of a name; file systems allow 255, and a temporary name is 42 longer
 SEAL = b"sha256:"  # followed by the digits: the comment of a sealed zip file
 
 
@@ -37,6 +38,7 @@ def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
     path = pathlib.Path(path)
     if path.suffix == "":
         path = path.with_suffix(f".{suffix}")
+    path = pathlib.Path(os.path.realpath(path))  # as open does, write where a link leads
     path.parent.mkdir(parents=True, exist_ok=True)
     with _partial(path, is_folder=False) as partial:
         with open(partial, "w+b") as file:
@@ -85,6 +87,21 @@ def is_unbroken(file: BinaryIO) -> bool:
     return comment in (b"", SEAL + checksum(file, end).encode())
 
 
+def stored_members(archive: zipfile.ZipFile) -> list[str]:
+    """
+    The names of the members of a zip file that SB3 or this package writes, which are never compressed.
+
+    :raises ValueError: if they would take more memory than the file has bytes
+    """
+    infos = archive.infolist()
+    if any(info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size for info in infos):
+        raise ValueError("its members are compressed, which files of this package never are")
+    end = archive.start_dir  # type: ignore[attr-defined]
+    if sum(info.file_size for info in infos) > end:
+        raise ValueError("its members overlap")
+    return [info.filename for info in infos]
+
+
 @contextmanager
 def atomic_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """
@@ -110,10 +127,11 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
     Create an empty file or folder next to ``path`` with a unique name, and remove it afterwards. Its process holds a lock on
     it while writing, so one without a lock is a leftover.
     """
-    remove_leftovers(path.parent, glob.escape(path.name))
+    name = os.fsencode(path.name)[:LONGEST].decode(errors="ignore")
+    remove_leftovers(path.parent, glob.escape(name))
     descriptor = None
     while True:  # another process may mistake it for a leftover before it is locked
-        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+        partial = path.with_name(f".{name}.{uuid.uuid4().hex}.partial")
         partial.mkdir() if is_folder else partial.touch()
         if fcntl is None:
             break

@@ -15,8 +15,9 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import open_path, recursive_getattr, save_to_zip_file
+from stable_baselines3.common.save_util import recursive_getattr, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_eqr.common.checks.validation import check_names
 from sb3_eqr.common.saving.buffers import read_buffer, write_buffer
@@ -26,44 +27,94 @@ from sb3_eqr.common.saving.checkpoints import (
     read_manifest,
     restore_environment,
     restore_generators,
-    warn_of_hidden,
+    warn_of_unknown,
 )
-from sb3_eqr.common.saving.files import atomic_write, is_unbroken, seal
-from sb3_eqr.common.saving.plain_data import UntrustedError, decode, encode, names_in
+from sb3_eqr.common.saving.files import atomic_write, is_unbroken, seal, stored_members
+from sb3_eqr.common.saving.plain_data import UntrustedError, decode, encode
 from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
+
+LARGEST_DATA = 100 << 20  # bytes of a model's attributes
+MEMORY_PER_BYTE = 8  # of a file: both target copies, and what their initialisation needs
 
 SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 
 
-def is_whole_model(source: pathlib.Path | bytes) -> bool:
+def locate(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
     """
-    :param source: an existing file, or its content
-    :return: whether it is an unchanged zip file with everything that SB3's ``save`` writes. The components of a model are zip
-        files themselves, so a truncated file may still look like a zip file.
+    :param path: a file, whose extension may be left out
+    :param suffix: that extension, without the dot
+    :return: the existing file; ``path`` if there is none, so that opening it raises
+    :raises ValueError: if there is a folder, or something that is not a regular file
     """
+    place = pathlib.Path(path)
+    found = next((one for one in (place, place.parent / f"{place.name}.{suffix}") if one.is_file()), None)
+    if found is None and place.is_dir():
+        raise ValueError(f"{path} must be a file, got a folder. Use resume for a folder of checkpoints.")
+    if found is None and place.exists():
+        raise ValueError(f"{path} must be a regular file, got a pipe or a device.")
+    return found or place
+
+
+def read_model(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
+    """
+    Read a model's file once, so that what is checked is what is loaded. The components of a model are zip files themselves,
+    so a truncated file may still look like a zip file.
+
+    :param path: a file; its extension may be left out; the position of a file-like object is restored
+    :return: its content, an unchanged zip file with everything that SB3's ``save`` writes, none of it compressed
+    :raises ValueError: if it is anything else
+    """
+    if isinstance(path, (str, pathlib.Path)):
+        content = locate(path, "zip").read_bytes()
+    else:
+        place = path.tell()
+        content = path.read()
+        path.seek(place)
     try:
-        opened: Any = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")
-        with opened as file, zipfile.ZipFile(file) as archive:
-            is_model = {"data", "policy.pth", "system_info.txt"} <= set(archive.namelist())
-            return is_model and is_unbroken(file) and archive.testzip() is None
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):  # from damaged headers
-        return False
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = stored_members(archive)
+            for name in names:
+                if name.endswith(".pth") and zipfile.is_zipfile(member := archive.open(name)):
+                    stored_members(zipfile.ZipFile(member))
+            is_model = {"data", "policy.pth", "system_info.txt"} <= set(names) and archive.testzip() is None
+            is_model &= is_unbroken(io.BytesIO(content)) and archive.getinfo("data").file_size < LARGEST_DATA
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError, KeyError):
+        is_model = False
+    if not is_model:
+        raise ValueError(
+            f"{path} must be a complete file written by an agent's save, got a truncated or damaged file, or another kind of "
+            "file. Load an earlier checkpoint."
+        )
+    return content
 
 
-def read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
+def data_of(content: bytes) -> dict[str, Any]:
+    """The attributes of a saved model as JSON, without executing code in the file."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        try:
+            return json.loads(archive.read("data"))
+        except RecursionError as error:
+            raise ValueError("data must be the attributes of an agent, got JSON that is too deep.") from error
+
+
+class LimitedMemory(TorchDispatchMode):
     """
-    Read the attributes of a saved model as JSON, without executing code in the file; empty if the file is not a model. The
-    position of a file-like object is restored.
+    Raises ValueError when tensors of more than ``n_bytes`` have been created: a file is not larger than the agent that it
+    describes.
     """
-    place = path if isinstance(path, (str, pathlib.Path)) else path.tell()
-    found = find_file(path) if isinstance(path, (str, pathlib.Path)) else path
-    if found is None or not zipfile.is_zipfile(found):
-        return {}  # SB3 raises an error later
-    with zipfile.ZipFile(found) as archive:  # type: ignore[arg-type]
-        data = json.loads(archive.read("data"))
-    if not isinstance(path, (str, pathlib.Path)):
-        path.seek(place)  # type: ignore[arg-type]
-    return data
+
+    def __init__(self, n_bytes: int):
+        super().__init__()
+        self.left = n_bytes
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Count the memory of new tensors before anything is written to it."""
+        found = func(*args, **(kwargs or {}))
+        if func._overloadpacket is th.ops.aten.empty:
+            self.left -= found.nbytes
+            if self.left < 0:
+                raise ValueError("the agent that policy_kwargs describe is much larger than the file.")
+        return found
 
 
 def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
@@ -89,20 +140,6 @@ def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
             f"If you trust the file, pass trust=True, or pass custom_objects for {', '.join(refused)}."
         )
     return found
-
-
-def refuse_folder(path: Any) -> None:
-    """Raise ValueError if the path is a folder instead of a file."""
-    if isinstance(path, (str, pathlib.Path)) and (place := pathlib.Path(path)).is_dir():
-        if not any(place.with_name(f"{place.name}.{suffix}").is_file() for suffix in ("zip", "pkl")):
-            raise ValueError(f"{path} must be a file, got a folder. Use resume for a folder of checkpoints.")
-
-
-def find_file(path: str | pathlib.Path) -> pathlib.Path | None:
-    """Find a model's file; the path may omit the extension. Raises ValueError for a folder."""
-    refuse_folder(path)
-    place = pathlib.Path(path)
-    return next((p for p in (place, place.with_name(f"{place.name}.zip")) if p.is_file()), None)
 
 
 class SafeFiles(OffPolicyAlgorithm):
@@ -174,17 +211,9 @@ class SafeFiles(OffPolicyAlgorithm):
             kwargs,
             [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:],
         )
-        source: Any = path
-        if isinstance(path, (str, pathlib.Path)) and (found := find_file(path)) is not None:
-            content = found.read_bytes()  # once, so that what is loaded is what was checked
-            if not is_whole_model(content):
-                raise ValueError(
-                    f"{found} must be a complete file written by {cls.__name__}.save, got a truncated or damaged file, or "
-                    "another kind of file. Load an earlier checkpoint."
-                )
-            source = io.BytesIO(content)
+        content = read_model(path)
         given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
-        data = {name: value for name, value in read_data(source).items() if name not in given}
+        data = {name: value for name, value in data_of(content).items() if name not in given}
         saved = data.get("policy_class") or {}
         module = str(saved.get("module", saved.get("__module__", ""))) if isinstance(saved, dict) else ""
         if module.startswith(("stable_baselines3.", "sb3_contrib.")):
@@ -193,7 +222,16 @@ class SafeFiles(OffPolicyAlgorithm):
                 "Load it with the class that saved it."
             )
         objects = {**decode_data(path, data, trust), **given}  # instead of SB3's unpickling
-        model = super().load(source, env, device, objects, print_system_info, force_reset, **kwargs)
+        with LimitedMemory(MEMORY_PER_BYTE * len(content) + LARGEST_DATA):
+            model = super().load(
+                io.BytesIO(content),  # type: ignore[arg-type]
+                env,
+                device,
+                objects,
+                print_system_info,
+                force_reset,
+                **kwargs,
+            )
         reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
         if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
@@ -221,12 +259,13 @@ class SafeFiles(OffPolicyAlgorithm):
         if env is None:
             raise ValueError("env must be an environment, built as in the original run, got None.")
         checkpoint, manifest = read_manifest(pathlib.Path(path))
-        is_exact = not manifest["hidden"]
+        is_exact = not manifest["unknown"]
         model = cls.load(checkpoint / MODEL, env, device, force_reset=not is_exact, trust=trust)
         if (checkpoint / BUFFER).is_file():
             model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
-        if not restore_environment(model, checkpoint, manifest, wrappers_only=not is_exact):
-            warn_of_hidden(checkpoint, manifest)
+        restore_environment(model, manifest, is_exact)
+        if not is_exact:
+            warn_of_unknown(checkpoint, manifest)
         restore_generators(model, manifest)
         return model
 
@@ -273,8 +312,7 @@ class SafeFiles(OffPolicyAlgorithm):
 
     def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:
         before = self.replay_buffer
-        refuse_folder(path)
-        file = open_path(path, "r", verbose=self.verbose, suffix="pkl")
+        file = open(locate(path, "pkl"), "rb") if isinstance(path, (str, pathlib.Path)) else path
         try:
             is_ours = zipfile.is_zipfile(file)
             if is_ours and not is_unbroken(file):  # type: ignore[arg-type]
@@ -283,10 +321,9 @@ class SafeFiles(OffPolicyAlgorithm):
             if is_ours:
                 return read_buffer(file, before)  # type: ignore[arg-type]
             if not trust:
-                named = ", ".join(names_in(file.read()))
                 raise ValueError(
-                    "it is truncated, or a pickle, and loading a pickle runs the code that it names"
-                    f"{f' ({named})' if named else ''}: pass trust=True if you trust the file"
+                    "it is truncated, or a pickle, and loading a pickle runs the code that it names: "
+                    "pass trust=True if you trust the file"
                 )
             super().load_replay_buffer(file)  # type: ignore[arg-type]
             return self.replay_buffer, {}

@@ -6,9 +6,6 @@ classes of the packages that agents use. Any other value is pickled, and unpickl
 import base64
 import enum
 import importlib
-import io
-import pickle
-import pickletools
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
@@ -44,11 +41,7 @@ SPACES |= {"MultiBinary": ("n",), "Dict": ("spaces",), "Tuple": ("spaces",)}
 
 
 class UntrustedError(ValueError):
-    """A file contains pickles, and unpickling runs the functions they name. ``names``: these functions and classes."""
-
-    def __init__(self, names: list[str]):
-        super().__init__(", ".join(names))
-        self.names = names
+    """A file contains pickles, and unpickling runs the functions they name."""
 
 
 def encode(value: Any) -> Any:
@@ -77,10 +70,9 @@ def _encode_container(value: Any) -> Any:
 
 
 def _encode_array(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
-        file = io.BytesIO()
-        np.save(file, value, allow_pickle=False)
-        return {KIND: "array", "is_scalar": isinstance(value, np.generic), "npy": base64.b64encode(file.getvalue()).decode()}
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biufcSUMm":
+        data = base64.b64encode(value.tobytes()).decode()
+        return {KIND: "scalar" if value.ndim == 0 else "array", "dtype": value.dtype.str, "shape": value.shape, "data": data}
     if isinstance(value, th.dtype):
         return {KIND: "dtype", "name": str(value).removeprefix("torch.")}
     if isinstance(value, th.device):
@@ -119,6 +111,15 @@ def _encode_known(value: Any) -> Any:
     return {KIND: "object", **name, "attributes": {key: encode(item) for key, item in vars(value).items()}}
 
 
+def without_pickles(value: Any) -> Any:
+    """Encoded data with the types of pickled objects in place of their pickles, which differ from process to process."""
+    if isinstance(value, list):
+        return [without_pickles(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    return value["type"] if value.get(KIND) == "pickle" else {key: without_pickles(item) for key, item in value.items()}
+
+
 def decode(value: Any, trust: bool = False) -> Any:
     """
     Convert JSON back to a value.
@@ -134,7 +135,7 @@ def decode(value: Any, trust: bool = False) -> Any:
     if not isinstance(value, Mapping):
         return value
     if ":serialized:" in value:  # SB3's own format
-        return _decode_pickle({"pickle": value[":serialized:"]}, trust)
+        return _decode_pickle({"pickle": value[":serialized:"], "type": value.get(":type:")}, trust)
     if KIND not in value:
         return {key: decode(item, trust) for key, item in value.items()}
     if value[KIND] not in DECODERS:
@@ -143,8 +144,9 @@ def decode(value: Any, trust: bool = False) -> Any:
 
 
 def _decode_array(value: Mapping[str, Any], trust: bool) -> Any:
-    array = np.load(io.BytesIO(base64.b64decode(value["npy"])), allow_pickle=False)
-    return array[()] if value["is_scalar"] else array
+    content = bytearray(base64.b64decode(value["data"]))  # writeable; and no larger than the file, whatever it declares
+    array = np.frombuffer(content, np.dtype(str(value["dtype"]))).reshape(value["shape"])
+    return array[()] if value[KIND] == "scalar" else array
 
 
 def _decode_dtype(value: Mapping[str, Any], trust: bool) -> th.dtype:
@@ -188,10 +190,9 @@ def _decode_object(value: Mapping[str, Any], trust: bool) -> Any:
 
 
 def _decode_pickle(value: Mapping[str, Any], trust: bool) -> Any:
-    content = base64.b64decode(value["pickle"])
     if not trust:
-        raise UntrustedError(names_in(content))
-    return cloudpickle.loads(content)
+        raise UntrustedError(f"a pickle of {value.get('type')}")
+    return cloudpickle.loads(base64.b64decode(value["pickle"]))
 
 
 DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
@@ -199,6 +200,7 @@ DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
     "tuple": lambda value, trust: tuple(decode(value["items"], trust)),
     "deque": lambda value, trust: deque(decode(value["items"], trust), value["maxlen"]),
     "array": _decode_array,
+    "scalar": _decode_array,
     "dtype": _decode_dtype,
     "device": lambda value, trust: th.device(value["name"]),
     "tensor": lambda value, trust: th.from_numpy(np.ascontiguousarray(decode(value["array"], trust))),
@@ -230,28 +232,3 @@ def _is_legal(value: Any) -> bool:
     else:
         legal = isinstance(value, FunctionType) and str(value.__module__).startswith("sb3_eqr.common.groups.")
     return legal and "<locals>" not in value.__qualname__ and "<lambda>" not in value.__qualname__
-
-
-def names_in(content: bytes) -> list[str]:
-    """The names that a pickle would import, and so may run, found without loading it; "(unreadable)" stands for others."""
-    names: list[str] = []
-    top: list[Any] = []  # the strings on top of the stack, as far as they are known
-    memo: dict[int, Any] = {}
-    try:
-        for code, argument, _ in pickletools.genops(content):
-            if code.name in ("GLOBAL", "INST"):
-                names.append(str(argument).replace(" ", "."))
-            elif code.name == "STACK_GLOBAL":
-                known = len(top) >= 2 and all(isinstance(part, str) for part in top[-2:])
-                names.append(".".join(top[-2:]) if known else "(unreadable)")
-            if code.name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
-                memo[len(memo) if argument is None else int(argument)] = top[-1] if top else None
-            elif code.name in ("GET", "BINGET", "LONG_BINGET"):
-                top.append(memo.get(int(str(argument))))
-            elif "UNICODE" in code.name or "STRING" in code.name:
-                top.append(argument)
-            elif code.name not in ("PROTO", "FRAME"):
-                top = []
-    except (ValueError, pickle.UnpicklingError):
-        names.append("(unreadable)")
-    return sorted(set(names))

@@ -24,6 +24,8 @@ def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
 def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
     """Restore a state returned by :func:`get_rng_state`."""
     random.setstate(state["python"])
+    if not 0 <= state["numpy"][2] <= 624:  # NumPy does not check it, and reads beyond its array
+        raise ValueError(f"numpy must have a position in 0 to 624, got {state['numpy'][2]}.")
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
     if len(state["cuda"]) == th.cuda.device_count():

@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_eqr.common.checks.validation import check_same_parameters
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.saving.models import find_file, is_whole_model, read_data
+from sb3_eqr.common.saving.models import data_of, read_model
 
 ENCODER = "features_extractor"
 LATENT_PARTS = ("embedding", "transition", "action_symmetry", "symmetry_projection")  # κ, ρ and b; r_ψ belongs to the task
@@ -25,9 +25,10 @@ def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.Buffere
     :param path: file of either agent
     :raises ValueError: if the file is not an EqR agent, or its group, trunk, number of actions or order of keys differs
     """
-    found = _saved_parts(path, policy.device)
+    content = read_model(path)
+    found = _saved_parts(content, path, policy.device)
     described = {name: policy.description[name] for name in ("group", "observation keys")}
-    check_same_parameters(described, read_data(path).get("policy_description", {}))
+    check_same_parameters(described, data_of(content).get("policy_description", {}))
     modules = representation(policy)
     for name, module in modules.items():
         expected = {key: f"of shape {tuple(value.shape)}" for key, value in module.state_dict().items()}
@@ -54,15 +55,9 @@ def representation(policy: EqRPolicy) -> dict[str, nn.Module]:
     return {ENCODER: policy.online.features_extractor} | {name: part for name, part in parts.items() if part is not None}
 
 
-def _saved_parts(path: str | pathlib.Path | io.BufferedIOBase, device: th.device) -> dict[str, dict[str, th.Tensor]]:
+def _saved_parts(content: bytes, path: Any, device: th.device) -> dict[str, dict[str, th.Tensor]]:
     """The parameters of each component of the representation in a file."""
-    if isinstance(path, (str, pathlib.Path)):
-        found_file = find_file(path)
-        if found_file is not None and not is_whole_model(found_file):
-            raise ValueError(
-                f"load_representation: {path} must be a complete file written by an agent's save, got a truncated one."
-            )
-    _, saved, _ = load_from_zip_file(path, load_data=False, device=device)  # type: ignore[arg-type]
+    _, saved, _ = load_from_zip_file(io.BytesIO(content), load_data=False, device=device)  # type: ignore[arg-type]
     parameters: Any = (saved or {}).get("policy", {})
     if not any(name.startswith("latent_model.") for name in parameters):
         raise ValueError(f"load_representation: {path} must be a file of EqRQRDQN or EqRRainbow, got another one.")
