@@ -374,7 +374,7 @@ def test_atari_games_are_saved_in_the_middle():
     state, hidden = capture(env)
     assert not hidden
     copied.reset()
-    restore(copied, json.loads(json.dumps(state)))
+    restore(copied, json.loads(json.dumps(state)), wrappers_only=False)
     lives = []
     for _ in range(70):
         actions = rng.integers(0, env.action_space.n, 1)

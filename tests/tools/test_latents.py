@@ -14,7 +14,7 @@ from sb3_eqr.envs import SlidingBall, make_atari100k_env
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.latents import coordinate_names, coordinates, encode, frame, play
-from tests.toys import ChainEnv, IntegerEnv
+from tests.toys import ChainEnv
 
 sb3_eqr.envs.register()
 BALL = {"group": "SO(2)", "n_blocks": 1, "parameterization": "gram-schmidt", "whiten": True}
@@ -48,17 +48,6 @@ def test_observations_are_normalised_once():
     env.training = False
     found = play(model, env, n_steps=40, depth=2, deterministic=True, seed=3).samples.observations.numpy()
     np.testing.assert_allclose(found[:5], np.concatenate(stepped(model, env, 5)), rtol=1e-6)
-
-
-def test_normalised_integers_are_not_rounded():
-    """VecNormalize keeps the integer space of vectors."""
-    env = VecNormalize(make_vec_env(IntegerEnv, 1), norm_reward=False, norm_obs_keys=["count"])
-    model = EqRQRDQN("MultiInputPolicy", env, buffer_size=200, learning_starts=500, device="cpu", seed=0).learn(100)
-    env.training = False
-    found = play(model, env, n_steps=40, depth=2, deterministic=True, seed=3).samples.observations
-    expected = stepped(model, env, 5)
-    np.testing.assert_allclose(found["count"][:5], np.concatenate([obs["count"] for obs in expected]), rtol=1e-6)
-    assert found["kind"][:5].flatten().tolist() == [0, 1, 2, 3, 4]
 
 
 def test_the_same_seed_plays_the_same_without_side_effects():

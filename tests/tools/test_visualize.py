@@ -370,7 +370,7 @@ def saved(tmp_path_factory):
     [
         ("", "the following arguments are required: MODEL"),
         ("nothing.zip", "MODEL must be the path of a .zip file, such as .*, got 'nothing.zip'"),
-        ("{cut}", "must be a file written by an agent's save, got a truncated file"),
+        ("{cut}", "must be a complete file written by an agent's save, got a truncated"),
         ("{model}", r"--env must be the agent's environment, got none, and RL Zoo's args\.yml is not"),
         ("{model} --env Ring-v1", "'Ring-v1' is not registered with gymnasium. Did you mean 'Ring-v0'?"),
         ("{model} --env Nope-v0", "'Nope-v0' is not registered with gymnasium. Environments of another package need"),

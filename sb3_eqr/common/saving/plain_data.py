@@ -52,7 +52,9 @@ def encode(value: Any) -> Any:
         found = encoder(value)
         if found is not None:
             return found
-    return {KIND: "pickle", "type": str(type(value)), "pickle": base64.b64encode(cloudpickle.dumps(value)).decode()}
+    kind = value if isinstance(value, (type, FunctionType)) else type(value)
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    return {KIND: "pickle", "type": name, "pickle": base64.b64encode(cloudpickle.dumps(value)).decode()}
 
 
 def _encode_container(value: Any) -> Any:
