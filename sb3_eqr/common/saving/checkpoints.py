@@ -107,7 +107,9 @@ def _last_named(folder: pathlib.Path) -> Iterator[None]:
 
 
 def checksum_of(path: pathlib.Path) -> str:
-    """SHA-256 of a file, as hexadecimal digits."""
+    """SHA-256 of a file, as hexadecimal digits; raises FileNotFoundError if it is not a regular one, such as a pipe."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.name} is not a file")
     with open(path, "rb") as file:
         return checksum(file, path.stat().st_size)
 
