@@ -94,7 +94,7 @@ def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dic
 
 def write_video(model: EqRAlgorithm, env: VecEnv, folder: pathlib.Path, depth: int, args: argparse.Namespace) -> None:
     """:param folder: folder for play.mp4 and play.gif"""
-    from sb3_eqr.visualize.animation import record  # only videos need its libraries
+    from sb3_eqr.visualize.film import record  # only videos need its libraries
 
     record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
 
