@@ -16,6 +16,10 @@ PASS_TRUST = "If you know where the file comes from, pass --trust."
 # A file may name the wrappers of these modules, except those that write files.
 WRAPPERS: tuple[str, ...] = ("sb3_eqr.envs.", "stable_baselines3.common.atari_wrappers.", "stable_baselines3.common.vec_env.")
 WRAPPERS += ("sb3_contrib.common.wrappers.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
+EVALUATED = ("normalize", "policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")  # strings that RL Zoo evaluates
+IMPORTED = ("policy", "replay_buffer_class", "callback")  # names that it imports
+PLAIN = (ast.Expression, ast.Call, ast.Name, ast.Load, ast.keyword, ast.Dict, ast.List, ast.Tuple, ast.Constant, ast.UnaryOp)
+PLAIN += (ast.USub,)  # type: ignore[assignment]
 WRITING = ("Monitor", "Record", "Video")  # parts of names
 # The only names in the statistics of VecNormalize. NumPy has moved its private modules from core to _core.
 STATISTICS = {
@@ -86,12 +90,9 @@ def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None
     for key in ("env_wrapper", "vec_env_wrapper"):
         named += [name for name in wrapper_names(config.get(key)) if not _is_harmless(name)]
     named = [name for name in named if name not in packages and not name.startswith(tuple(f"{p}." for p in packages))]
-    normalize = config.get("normalize")
-    if isinstance(normalize, str):
-        try:
-            ast.literal_eval(normalize)
-        except (ValueError, SyntaxError):
-            named.append(normalize)
+    named += [f"{key}: {config[key]}" for key in EVALUATED if isinstance(config.get(key), str) and not is_plain(config[key])]
+    imported = [(key, name) for key in IMPORTED for name in wrapper_names(config.get(key)) if key != "policy" or "." in name]
+    named += [f"{key}: {name}" for key, name in imported if not name.startswith(tuple(f"{p}." for p in packages))]
     if named:
         found = ", ".join(map(str, named))
         raise ValueError(
@@ -99,6 +100,17 @@ def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None
             f"files, got {found}. {PASS_TRUST}"
         )
     check_statistics(folder / "vecnormalize.pkl")
+
+
+def is_plain(expression: str) -> bool:
+    """Whether evaluating a string gives a value made of numbers, strings and containers, and calls nothing but ``dict``."""
+    try:
+        nodes = list(ast.walk(ast.parse(expression, mode="eval")))
+    except SyntaxError:
+        return False
+    calls = [node.func for node in nodes if isinstance(node, ast.Call)]
+    names = [node.id for node in nodes if isinstance(node, ast.Name)]
+    return all(isinstance(node, PLAIN) for node in nodes) and names == ["dict"] * len(calls)
 
 
 def check_statistics(path: pathlib.Path) -> None:

@@ -5,8 +5,8 @@ Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metr
 
 ``__main__`` parses the command line, ``loading`` loads model and environment, ``trust`` checks files from others. ``latents``
 runs the agent and encodes, ``measures`` and ``findings`` compute, ``diagnostics`` collects the metrics and the verdict;
-``tables`` and ``pictures`` write them, ``latent_figure`` plots the states. For the animation, ``animation`` collects the
-frames, ``pixels`` and ``sketches`` prepare what they show, ``canvas`` draws. ``callback`` is for use during training.
+``tables`` and ``pictures`` write them, ``latent_figure`` plots the states, ``film`` animates them. ``callback`` is for use
+during training.
 """
 
 import importlib
@@ -19,7 +19,7 @@ _MODULES = {
     "LatentCallback": "callback",
     "diagnose": "diagnostics",
     "play": "latents",
-    "record": "animation",
+    "record": "film",
 }
 
 

@@ -5,6 +5,7 @@ import importlib
 import pathlib
 import runpy
 import sys
+from collections.abc import Callable
 
 import gymnasium as gym
 import yaml
@@ -15,6 +16,7 @@ from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.checkpoints import read_manifest
 from sb3_eqr.common.saving.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
+from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
@@ -124,6 +126,9 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     check_device(args.device)
     check_loggers(args.track, args.tensorboard_log)
     check_trained_agent(args.trained_agent)
+    if args.trained_agent and not args.trust:
+        statistics = pathlib.Path(args.trained_agent).parent / EnvironmentName(args.env) / "vecnormalize.pkl"
+        check_files(lambda: check_statistics(statistics))
     if path is None:
         check_entry(args.hyperparams, algo, "--hyperparams")
         return None
@@ -199,9 +204,9 @@ def check_runs(arguments: list[str]) -> None:
 
 
 def check_trained(args: argparse.Namespace) -> None:
-    """Exit with a message if there is no trained agent at the given place."""
+    """Exit with a message if there is no trained agent at the given place, or if the files beside it would run code."""
     try:
-        get_model_path(
+        *_, folder = get_model_path(
             args.exp_id,
             args.folder,
             args.algo or "ppo",
@@ -220,6 +225,17 @@ def check_trained(args: argparse.Namespace) -> None:
         if places and not ids:
             found = f"Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
         fail(f"{error}. {found}")
+    beside = pathlib.Path(folder, EnvironmentName(args.env))
+    if args.algo in AGENTS and not args.trust and (beside / "args.yml").is_file():
+        check_files(lambda: check_zoo_folder(beside, args.gym_packages))
+
+
+def check_files(check: Callable[[], None]) -> None:
+    """Exit with a message if files from others are refused."""
+    try:
+        check()
+    except ValueError as error:
+        fail(str(error))
 
 
 def save_where_nothing_is_shown(command: str) -> None:

@@ -181,7 +181,7 @@ def test_different_runs_cannot_share_a_folder(checkpoint):
         ({"seed": None}, r"seed = 3 there, None here"),
         ({"policy_kwargs": group}, r"policy_kwargs = \{.*'latent_hidden_dim': 8,.*'group': 'SO\(3\)'"),
         ({"resets": {"interval": 5}}, r"resets = "),
-        ({"learning_rate": lambda progress: 1e-3}, r"learning_rate = 0.0001 there, .*function"),
+        ({"learning_rate": lambda progress: 1e-3}, r"learning_rate = 0.0001 there, .*lambda"),
     ):
         other = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, **changes})
         with pytest.raises(ValueError, match=rf"must be empty or hold checkpoints of this run, .*{why}.*Pass another folder"):

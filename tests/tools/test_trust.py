@@ -1,0 +1,137 @@
+"""The table of docs/files.md: which commands run code that files from others name. Each line is executed."""
+
+import pathlib
+import pickle
+import re
+import shutil
+import sys
+
+import pytest
+import yaml
+from stable_baselines3 import DQN
+
+from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr.trust import is_plain
+from sb3_eqr.zoo.__main__ import main
+
+DOCS = pathlib.Path(__file__).parents[2] / "docs" / "files.md"
+SMALL = {"buffer_size": 500, "learning_starts": 10, "device": "cpu"}
+
+
+class Runs:
+    def __reduce__(self):
+        return pathlib.Path.touch, (pathlib.Path("ran"),)
+
+
+def ran(call, *args):
+    """Whether a call, which may fail, ran the code."""
+    try:
+        call(*args)
+    except (Exception, SystemExit) as error:
+        print(error)
+    found = pathlib.Path("ran").exists()
+    pathlib.Path("ran").unlink(missing_ok=True)
+    return found
+
+
+@pytest.fixture
+def command(monkeypatch):
+    def call(line):
+        monkeypatch.setattr(sys, "argv", ["sb3-eqr", *line.split()])
+        main()
+
+    return call
+
+
+@pytest.fixture
+def hostile(tmp_path, monkeypatch):
+    """The folder of a run, whose settings can be changed: returns a function that writes them."""
+    monkeypatch.chdir(tmp_path)
+    for algo, kind in (("eqr_qrdqn", EqRQRDQN), ("dqn", DQN)):
+        folder = pathlib.Path("logs", algo, "CartPole-v1_1")
+        (folder / "CartPole-v1").mkdir(parents=True)
+        kind("MlpPolicy", "CartPole-v1", **SMALL).save(folder / "CartPole-v1")
+
+    def write(algo="eqr_qrdqn", statistics=False, **settings):
+        beside = pathlib.Path("logs", algo, "CartPole-v1_1", "CartPole-v1")
+        config = {"policy": "MlpPolicy", "n_timesteps": 50, "normalize": statistics, **settings}
+        (beside / "config.yml").write_text(yaml.safe_dump(config))
+        (beside / "args.yml").write_text(yaml.safe_dump({"env": "CartPole-v1", "gym_packages": [], "env_kwargs": None}))
+        (beside / "vecnormalize.pkl").unlink(missing_ok=True)
+        if statistics:
+            (beside / "vecnormalize.pkl").write_bytes(pickle.dumps(Runs()))
+        return beside.parent
+
+    return write
+
+
+TOUCH = "__import__('pathlib').Path('ran').touch()"
+SETTINGS = [
+    {"policy_kwargs": f"dict(net_arch=[{TOUCH} or 8])"},
+    {"replay_buffer_kwargs": f"[{TOUCH}]"},
+    {"monitor_kwargs": f"dict(x={TOUCH})"},
+    {"normalize": f"dict(x={TOUCH})"},
+    {"statistics": True},
+]
+
+
+def test_the_table_is_the_one_that_is_tested():
+    rows = re.findall(r"^\| (?!what|-)(.*) \| (yes|no) \|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [answer for _, answer in rows] == "no yes no no no no yes yes yes yes no".split()
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_commands_that_run_no_code(hostile, command, settings, tmp_path):
+    folder = hostile(**settings)
+    model = folder / "CartPole-v1.zip"
+    place = f"--algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs"
+    EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(30, checkpoints(folder))
+    lines = [f"train --algo eqr_qrdqn --env CartPole-v1 --resume {folder} -n 60 -f new", f"enjoy {place} -n 5 --no-render"]
+    lines += [f"record_video {place} -n 5", f"push_to_hub {place} -orga none --dry-run"]
+    if "statistics" in settings:
+        lines += [f"train --algo eqr_qrdqn --env CartPole-v1 -i {model} -n 20 -f new -params normalize:True"]
+    for line in lines:
+        assert not ran(command, line), line
+
+
+def checkpoints(folder):
+    from sb3_eqr import ExactCheckpointCallback
+
+    return ExactCheckpointCallback(20, folder / "checkpoints")
+
+
+def test_commands_that_run_code(hostile, command, tmp_path):
+    folder = hostile(**SETTINGS[0])
+    hostile("dqn", **SETTINGS[3])
+    settings = folder / "CartPole-v1" / "config.yml"
+    pathlib.Path("file.yml").write_text(yaml.safe_dump({"CartPole-v1": yaml.safe_load(settings.read_text())}))
+    place = f"--env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render"
+    assert ran(command, "train --algo eqr_qrdqn --env CartPole-v1 --conf-file file.yml -n 20 -f new")
+    assert ran(command, f"enjoy --algo dqn {place}")
+    hostile(**SETTINGS[3])
+    assert ran(command, f"enjoy --algo eqr_qrdqn {place} --trust")
+
+
+def test_files_that_run_no_code_without_trust(hostile, tmp_path):
+    folder = hostile()
+    model = EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL)
+    pathlib.Path("buffer.pkl").write_bytes(pickle.dumps(Runs()))
+    assert not ran(model.load_replay_buffer, "buffer.pkl")
+    assert ran(lambda: model.load_replay_buffer("buffer.pkl", trust=True))
+    model.learning_rate = Runs()
+    model.save("model")
+    for load in (EqRQRDQN.load, model.set_parameters, model.load_representation, EqRRainbow.load):
+        assert not ran(load, "model")
+    assert ran(lambda: EqRQRDQN.load("model", trust=True))
+    shutil.copytree(folder, "checkpoint-000000000001")
+    assert not ran(EqRQRDQN.resume, "checkpoint-000000000001", model.get_env())
+
+
+@pytest.mark.parametrize("text", ["dict(a=[1, -2.5], b=dict(c='x'))", "{'a': (1, None)}", "True"])
+def test_plain_expressions(text):
+    assert is_plain(text)
+
+
+@pytest.mark.parametrize("text", [TOUCH, "dict(a=dict)", "dict.__class__", "[x for x in dict()]", "print(1)", "(", "nn.ReLU"])
+def test_other_expressions(text):
+    assert not is_plain(text)
