@@ -24,3 +24,7 @@ def main() -> None:
         others = "" if extra in COMMANDS else ". " + " ".join(f'sb3-eqr {name} needs ".[{name}]".' for name in COMMANDS)
         sys.exit(f"sb3-eqr: {error}{advice}{others}")
     run()
+
+
+if __name__ == "__main__":
+    main()

@@ -17,6 +17,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, check, check_arguments, number
@@ -294,6 +295,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if any(kind.__module__.split(".")[0] == "gym" for kind in type(env).__mro__):
+            env = _patch_env(env)  # environments of the old gym need shimmy, as in SB3
         validation.check_env(env)
         if isinstance(found := getattr(env, "observation_space", None), spaces.Space):
             validation.check_observation_space(found)

@@ -41,7 +41,7 @@ class PixelPendulum(gym.Env):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20, "periodic": ["angle"]}
 
     def __init__(self, gravity: bool = True, size: int = 48, n_torques: int = 3, render_mode: str | None = None):
         check("size", size, integer(SMALLEST_PICTURE))

@@ -37,7 +37,7 @@ class SlidingBall(gym.Env):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periodic": ["position"]}
 
     def __init__(
         self,

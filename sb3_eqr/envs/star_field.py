@@ -40,7 +40,7 @@ class StarField(gym.Env):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periodic": ["translation"]}
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ import argparse
 import os
 import pathlib
 import sys
+from collections.abc import Sequence
 from typing import NoReturn
 
 import gymnasium as gym
@@ -65,10 +66,11 @@ def run(args: argparse.Namespace) -> None:
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
     actions, factors = action_names(env, model.policy.latent_model.action_dim), factor_names(env)
+    periodic = (env.get_attr("metadata", 0)[0] or {}).get("periodic", ())
     tables = all_tables(diagnostics, actions, factors)
     write_tables(tables, folder)
     figures = all_pictures(diagnostics, actions, factors)
-    write_pictures({**figures, **latent_figures(model, played, factors)}, folder)
+    write_pictures({**figures, **latent_figures(model, played, factors, periodic)}, folder)
     if args.video:
         write_video(model, env, folder, depth, args)
     print(diagnostics.summary)
@@ -77,9 +79,10 @@ def run(args: argparse.Namespace) -> None:
     print(f"Written: {folder}")
 
 
-def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dict[str, Figure]:
+def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str], periodic: Sequence[str] = ()) -> dict[str, Figure]:
     """
     :param factors: names of the true factors, if known
+    :param periodic: the keys of ``info`` whose factors are periodic, from the environment's metadata
     :return: one figure coloured by time, or one per factor
     """
     states = encode(model, played.samples.observations)
@@ -87,8 +90,8 @@ def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str]) -> dic
         return {"latents": latent_figure(model, states)}
     names = all_names(played.factors.shape[1], factors)
     return {
-        "latents" if i == 0 else f"latents_{name.replace(' ', '_')}": latent_figure(model, states, played.factors[:, i], name)
-        for i, name in enumerate(names)
+        f"latents_{name.replace(' ', '_')}": latent_figure(model, states, values, name, name.split(" ")[0] in periodic)
+        for name, values in zip(names, played.factors.T, strict=True)
     }
 
 

@@ -20,10 +20,15 @@ MAX_PANELS = 12
 MAX_POINTS = 400
 MAX_ARROWS = 150
 ABOUT = "A point per state: a block's translation, an arrow for its rotation, or its principal components."
-CYCLIC = ("position", "angle")  # factors that may wrap around: they get a cyclic colour map
 
 
-def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time") -> Figure:
+def latent_figure(
+    model: EqRAlgorithm,
+    states: th.Tensor,
+    values: np.ndarray | None = None,
+    label: str = "time",
+    is_periodic: bool = False,
+) -> Figure:
     """
     A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in
     Figure 3 of the paper); SE(2) and T(2) are points in the plane, with the direction of any rotation; a single number is
@@ -33,6 +38,7 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
     :param states: see :func:`~sb3_eqr.visualize.latents.encode`, (N, D)
     :param values: values for the colours, (N,); default: the order of the states
     :param label: label of the colours
+    :param is_periodic: whether the smallest and the largest of the values are the same, so that they get the same colour
     """
     kept = np.unique(np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int))
     colours = (np.arange(len(states)) if values is None else np.asarray(values))[kept]
@@ -42,14 +48,13 @@ def latent_figure(model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | N
     ]
     spreads = np.array([float(found.flatten(1).double().std(dim=0, correction=0).norm()) for _, _, found in blocks])
     shown = sorted(np.argsort(-spreads, kind="stable")[:MAX_PANELS])
-    cyclic = label.split(" ")[0] in CYCLIC
     with styled():
         figure = Figure(figsize=SIZE)  # a constrained layout would take longer than the drawing itself
         axes = make_axes(figure, len(shown))
         for ax, i in zip(axes, shown, strict=True):
             group, name, found = blocks[i]
             constant = spreads[i] <= ROUNDING * float(found.norm()) / len(found) ** 0.5
-            drawn = _draw(ax, group, found, colours, "twilight" if cyclic else "viridis")
+            drawn = _draw(ax, group, found, colours, "twilight" if is_periodic else "viridis")
             about = " (constant)" if constant else _outside(ax, drawn.get_offsets())
             ax.set_title(f"{name}{about}", loc="left", fontsize=8, pad=3)
             ax.tick_params(labelsize=6, length=2, pad=1)

@@ -650,3 +650,16 @@ def test_progress_bar_and_fake_images(make):
     env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=True)
     make(env, "CnnPolicy").learn(50, progress_bar=True)
     assert isinstance(env.action_space, spaces.Discrete)
+
+
+def test_flags_as_arrays_are_stored(make):
+    """As in SB3, whose DummyVecEnv takes arrays of shape (1,)."""
+
+    class Flags(ChainEnv):
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            return observation, np.array([reward]).item(), np.array([terminated]), np.array([truncated]), info
+
+    plain, model = (make(make_vec_env(env), learning_starts=1_000).learn(60) for env in (ChainEnv, Flags))
+    for name in ("dones", "timeouts", "rewards"):
+        assert np.array_equal(getattr(plain.replay_buffer, name), getattr(model.replay_buffer, name)), name

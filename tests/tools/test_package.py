@@ -113,3 +113,8 @@ def test_the_commands_of_the_installation_script_are_those_of_the_pages():
     assert all(
         "EqR" in text and "_000" not in re.sub(r"2_000|seed=1_000", "", text) for text in installation.scripts(ROOT).values()
     )
+
+
+def test_the_module_of_the_command_runs_it():
+    found = subprocess.run([sys.executable, "-m", "sb3_eqr.cli", "--version"], capture_output=True, text=True, check=True)
+    assert found.stdout.startswith("sb3_eqr ")

@@ -225,10 +225,12 @@ def test_plots_share_a_scale_and_have_margins():
     assert all(tick == round(tick) for tick in ax.get_xticks())
 
 
-@pytest.mark.parametrize("label, colours", [("angle", "twilight"), ("position 0", "twilight"), ("velocity", "viridis")])
-def test_cyclic_factors_have_cyclic_colours(label, colours):
+@pytest.mark.parametrize("is_periodic, colours", [(True, "twilight"), (False, "viridis")])
+def test_periodic_factors_have_cyclic_colours(is_periodic, colours):
     model = make_model(group="SE(2)")
-    figure = latent_figure(model, th.randn(9, 12, generator=th.Generator().manual_seed(0)), np.arange(9.0), label)
+    figure = latent_figure(
+        model, th.randn(9, 12, generator=th.Generator().manual_seed(0)), np.arange(9.0), "angle", is_periodic
+    )
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
 
 

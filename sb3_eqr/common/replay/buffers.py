@@ -164,7 +164,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.dones[self.pos] = done
         self.timeouts[self.pos] = 0.0
         if self.handle_timeout_termination:
-            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+            self.timeouts[self.pos] = [bool(info.get("TimeLimit.truncated", False)) for info in infos]
         self._episode_starts = np.array(done, dtype=bool)
         self.pos += 1
         if self.pos == self.buffer_size:

@@ -298,7 +298,12 @@ class SafeFiles(OffPolicyAlgorithm):
         found = {"algorithm": type(self).__name__, **notes, **_describe(loaded)}
         steps = found.pop("num_timesteps", self.num_timesteps)
         if expected != found:
-            raise ValueError(f"{path} must be a replay buffer of {expected}, got {found}. Load the one saved with this model.")
+            names = [name for name in expected if expected[name] != found.get(name)]
+            differs = ", ".join(f"{name} = {expected[name]}, got {found.get(name)}" for name in names)
+            raise ValueError(
+                f"{path} must be a replay buffer with {differs}. Load the one saved with this model, into a model with as "
+                "many environments and the same spaces as then."
+            )
         if steps != self.num_timesteps:
             warnings.warn(
                 f"{path}: this replay buffer was saved at step {steps}, but the model is at step {self.num_timesteps}. "
