@@ -22,6 +22,9 @@ demo: $(VENV)/installed
 
 test: lint type pytest
 
+# One thread per process: pytest runs two at once.
+quick pytest slow: export OMP_NUM_THREADS = 1
+
 # Fast unit tests: groups, losses, layers, latent model, sum tree, buffers.
 quick: $(VENV)/installed
 	$(BIN)/python -m pytest tests/unit

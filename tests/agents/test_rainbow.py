@@ -15,7 +15,7 @@ from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, Imp
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
-from tests.models import BOTH, MAKERS, PAPER, loss_terms, untrained
+from tests.models import BOTH, EITHER, MAKERS, PAPER, loss_terms, untrained
 from tests.toys import ChainEnv, ImageEnv
 
 make_rainbow = MAKERS[1]
@@ -424,6 +424,7 @@ def test_latents_are_scaled_to_the_unit_interval():
     th.testing.assert_close(with_layer(images), with_layer.linear(rescaled(with_layer.trunk(images))))
 
 
+@EITHER
 @BOTH
 @pytest.mark.parametrize("group", ["SE(2)", None])
 def test_trunks_by_name(make, group, network):

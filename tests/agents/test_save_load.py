@@ -266,7 +266,11 @@ KNOBS = {  # one reset before the file is written and one after; n and γ are be
 
 @pytest.mark.parametrize(
     "make, normalize, knobs",
-    [(MAKERS[0], False, {}), (MAKERS[1], True, {}), (MAKERS[1], False, KNOBS)],
+    [
+        pytest.param(MAKERS[0], False, {}, marks=pytest.mark.slow),
+        pytest.param(MAKERS[1], True, {}, marks=pytest.mark.slow),
+        (MAKERS[1], False, KNOBS),
+    ],
     indirect=["make"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(make, normalize, knobs, tmp_path):

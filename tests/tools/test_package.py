@@ -85,7 +85,7 @@ def test_readme_example_runs(tmp_path, monkeypatch):
     assert (tmp_path / "cartpole.zip").exists()
 
 
-@pytest.mark.parametrize("chosen", [None, "ACTIVE"])
+@pytest.mark.parametrize("chosen", [None, pytest.param("ACTIVE", marks=pytest.mark.slow)])
 def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen):
     """OpenMP reads the variable once, when PyTorch loads it. The user's choice is kept."""
     code = (

@@ -177,14 +177,13 @@ def test_options_can_be_abbreviated_as_in_rl_zoo(sb3_eqr, capfd, tmp_path):
     assert "'n_stepz' is not an argument" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("algo", ["eqr_qrdqn", "eqr_rainbow"])
 @pytest.mark.parametrize(
-    ("env_id", "name", "policy"),
+    ("algo", "env_id", "name", "policy"),
     [
-        ("FrozenLake-v1", "default", "MlpPolicy"),
-        ("SlidingBall-v0", "default-image", "CnnPolicy"),
-        ("SmallImages-v0", "default-small-image", "CnnPolicy"),
-        ("Dicts-v0", "default-dict", "MultiInputPolicy"),
+        ("eqr_qrdqn", "FrozenLake-v1", "default", "MlpPolicy"),
+        ("eqr_qrdqn", "SlidingBall-v0", "default-image", "CnnPolicy"),
+        ("eqr_rainbow", "SmallImages-v0", "default-small-image", "CnnPolicy"),
+        ("eqr_rainbow", "Dicts-v0", "default-dict", "MultiInputPolicy"),
     ],
 )
 def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
