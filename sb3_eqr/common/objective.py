@@ -128,16 +128,16 @@ class Objective:
         """The auxiliary losses along the rollout. The target encoder sees s_t with the online encoder's augmentation."""
         rollout, mask, rewards = samples.rollout_observations, samples.mask, samples.rollout_rewards
         assert rollout is not None and mask is not None and rewards is not None and samples.rollout_actions is not None
-        target_features = target_rollout = None
+        latent_model, target_features, target_rollout = self.policy.latent_model, None, None
         with th.no_grad():
-            if "symmetry" in names:
+            if latent_model.NEED_FEATURES.intersection(names):
                 target_features = features if self.latent_encoder is self.encoder else self.latent_encoder(observations)
-            if "aet" in names:
+            if latent_model.NEED_ROLLOUT.intersection(names):
                 target_rollout = self.latent_encoder(self.augment(flat(rollout)))  # (B * M, F)
         # After the end of an episode, action 0: what follows must not leak through batch statistics.
         actions = self.policy.embed_actions(samples.rollout_actions * mask.long())  # (B, M, A)
         target = self.policy.latent_target
-        return self.policy.latent_model(names, features, actions, rewards, mask, target, target_features, target_rollout)
+        return latent_model(names, features, actions, rewards, mask, target, target_features, target_rollout)
 
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -33,7 +33,8 @@ AET_LOSSES: dict[str, Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]] = 
 class LatentModel(nn.Module):
     """
     Latent states x = τ(s) are K blocks of a group, actions become group elements κ(x, a), and the next state is their
-    product. Everything that the auxiliary losses need is a component of this module; :func:`frozen_copy` of it is the target.
+    product. Everything that the auxiliary losses need is a component of this module; :func:`frozen_copy` of it is the target,
+    written x̄, κ̄, p̄, b̄. Options are in ``options.py``; weights and the encoder in front belong to the caller.
 
     :param embedding: the last layer of τ, from features, (B, F), to latent states, (B, D)
     :param group: group of the blocks
@@ -42,6 +43,9 @@ class LatentModel(nn.Module):
     :param options: all other options
     :param projection: p of the AET loss if ``options.projection`` is "head": a module from (N, D) to (N, P)
     """
+
+    NEED_FEATURES = frozenset({"symmetry"})  # losses that compare with the target's state of s_t,
+    NEED_ROLLOUT = frozenset({"aet"})  # and with those of s_{t+1} ... s_{t+M}
 
     def __init__(
         self,
@@ -115,8 +119,8 @@ class LatentModel(nn.Module):
         :param rewards: r_{t+1} ... r_{t+M}, (B, M)
         :param mask: 1 where the episode had not ended before step t+m, (B, M)
         :param target: the target copy of this model
-        :param target_features: of s_t from the target encoder, (B, F); "symmetry" needs them
-        :param target_rollout: of s_{t+1} ... s_{t+M} from the target encoder, (B * M, F); "aet" needs them
+        :param target_features: of s_t from the target encoder, (B, F), for the losses in ``NEED_FEATURES``
+        :param target_rollout: of s_{t+1} ... s_{t+M} from the target encoder, (B * M, F), for those in ``NEED_ROLLOUT``
         :return: (B,) for each name
         """
         state = self.embedding(features)  # x₀ = τ(s_t), (B, D)
@@ -149,7 +153,8 @@ class LatentModel(nn.Module):
 
     def aet_loss(self, predicted: th.Tensor, target_rollout: th.Tensor, mask: th.Tensor, target: "LatentModel") -> th.Tensor:
         """
-        Action-equivariant transitions (Eq. 18): the distance between p(x̂_m), after the predictor, and p̄(x̄_m).
+        Action-equivariant transitions (Eq. 18): the mean over valid m of d(p(x̂_m), p̄(x̄_m)), with the predictor after p, and
+        d(u, v) = ‖u/‖u‖ − v/‖v‖‖² or, with ``aet_loss="contrastive"``, InfoNCE (both in ``losses.py``).
 
         :return: (B,)
         """
@@ -172,12 +177,13 @@ class LatentModel(nn.Module):
         target: "LatentModel",
     ) -> th.Tensor:
         """
-        Group-equivariant transitions (Eq. 19): τ_g acts on the predicted next state x̂₁, and ρ(τ_g) κ̄ on the state x̄_j of a
-        random partner; both results should coincide.
+        Group-equivariant transitions (Eq. 19): d(b(τ_g · x̂₁), b̄(ρ(τ_g) · κ̄(x₀, a_t) · x̄_j)) with τ_g = x̄_j · x₀⁻¹, for a
+        random partner j of each sample. The action element is that of the sample's own state x₀, and acts on the partner's.
 
         :return: (B,)
         """
-        with th.no_grad():  # τ_g carries no gradient, as in the authors' code
+        # As in the authors' code, τ_g carries no gradient, nor does what comes from the target: on the right, only ρ learns.
+        with th.no_grad():
             partners = th.randint(len(state), (len(state),), device=state.device)
             partner = target.embedding(target_features)[partners]  # x̄_j of Algorithm 1, (B, D)
             symmetry = self.group.compose(self.blocks(partner), self.group.inverse(self.blocks(state)))  # τ_g
