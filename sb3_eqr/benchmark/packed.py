@@ -9,13 +9,61 @@ import pathlib
 import re
 from typing import Any
 
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt
+
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
-from sb3_eqr.benchmark.suites import Suite, merge, read_suite
+from sb3_eqr.benchmark.suites import Evaluation, Suite, merge, read_suite
 from sb3_eqr.common.saving.files import atomic_write
 
 SUFFIX = ".jsonl.xz"
-NEEDED = ("agent", "game", "seed", "protocol", "entry", "evaluations", "training", "losses")  # in every row
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
+
+
+class Evaluated(BaseModel):
+    """One evaluation: ``kind`` is "curve" or "final"; scores and lengths of its episodes."""
+
+    step: NonNegativeInt
+    kind: str
+    scores: list[FiniteFloat]
+    lengths: list[NonNegativeInt]
+
+
+class Trained(BaseModel):
+    """The episodes of training: the step at which each ended, its score and length."""
+
+    step: list[NonNegativeInt]
+    score: list[FiniteFloat]
+    length: list[NonNegativeInt]
+
+
+class Protocol(BaseModel):
+    """How the game was played."""
+
+    env_id: str
+    steps: PositiveInt
+    preprocessing: dict[str, Any]
+    evaluation: Evaluation
+
+
+class Row(BaseModel):
+    """What a report needs of a run; rows have more."""
+
+    agent: str
+    game: str
+    seed: NonNegativeInt
+    suite: str
+    protocol: Protocol
+    entry: dict[str, Any]
+    command: str
+    started: str
+    machine: dict[str, Any]
+    attempts: NonNegativeInt
+    wall_clock_s: FiniteFloat
+    steps_per_second: FiniteFloat
+    resumed_at: list[NonNegativeInt]
+    evaluations: list[Evaluated]
+    training: Trained
+    losses: list[dict[str, float | None]]
 
 
 def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
@@ -28,6 +76,8 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
         try:
             with lzma.open(path, "rt", encoding="utf-8") as lines:
                 first, *rows = [json.loads(line) for line in lines]
+            for row in rows:
+                Row.model_validate(row)
             return Suite.model_validate(first["suite"]), rows
         except (lzma.LZMAError, EOFError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
@@ -42,11 +92,10 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
 
 def _read_row(path: pathlib.Path) -> dict[str, Any]:
     try:
-        row = dict(json.loads(path.read_text(encoding="utf-8")))
-        if missing := [key for key in NEEDED if key not in row]:
-            raise ValueError(f"without {', '.join(missing)}")
+        row = json.loads(path.read_text(encoding="utf-8"))
+        Row.model_validate(row)
         return row
-    except (ValueError, TypeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{path} must be the result of a run, got a damaged file ({error}). Remove it and run it again."
         ) from error

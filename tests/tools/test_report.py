@@ -567,3 +567,22 @@ def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
         next(both.glob("runs/*/*/*/result.json")).write_text(damaged)
         with pytest.raises(ValueError, match=r"result.json must be the result of a run, got a damaged file"):
             compare([both], {}, False)
+
+
+def test_a_damaged_result_is_named(tmp_path, monkeypatch):
+    """Each value of a row in turn is replaced by values of other types."""
+    monkeypatch.setattr(report_module, "all_figures", lambda analysis: [])
+    folder = a_benchmark(tmp_path / "runs", {"dqn": {"Pong": [1.0]}})
+    (path,) = folder.glob("runs/*/*/*/result.json")
+    row = json.loads(path.read_text())
+    wrong = []
+    for key in row:
+        for value in (None, "text", -1.5, [], [None], {}, {"step": "x"}):
+            path.write_text(json.dumps({**row, key: value}))
+            try:
+                write_report([folder], {}, False, tmp_path / "report", reps=2)
+            except ValueError as error:
+                assert str(error).endswith(".") and len(str(error)) > 40, error
+            except Exception as error:
+                wrong.append(f"{key} = {value!r}: {error!r}")
+    assert wrong == []
