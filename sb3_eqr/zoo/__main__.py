@@ -77,6 +77,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
+    parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
@@ -124,6 +125,8 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     path = find_hyperparameters(algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
     check_device(args.device)
+    if args.n_timesteps == 0:
+        fail("-n must be >= 1 step, or -1 for the number in the file, got 0.")
     check_loggers(args.track, args.tensorboard_log)
     check_trained_agent(args.trained_agent)
     if args.trained_agent and not args.trust:

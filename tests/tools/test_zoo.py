@@ -87,6 +87,7 @@ def sb3_eqr(monkeypatch, capfd):
         ("train --algo eqr_qrdqn -optimize --checkpoint-every 9", "are for single runs, got a search"),
         ("train --algo ppo --resume nowhere", "--algo must be eqr_qrdqn or eqr_rainbow .*, got ppo"),
         ("train --algo eqr_qrdqn --resume nowhere", "nowhere must be a checkpoint .*, got nothing"),
+        ("train --algo eqr_qrdqn -n 0", "-n must be >= 1 step, or -1 for the number in the file, got 0"),
         ("train --algo eqr_qrdqn --checkpoint-every 0", "--checkpoint-every must be >= 1 step, got 0"),
     ],
 )
