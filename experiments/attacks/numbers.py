@@ -89,8 +89,12 @@ def not_a_number(folder: pathlib.Path) -> Finding:
                         wrong.append(f"{name}: {type(error).__name__}: {str(error)[:100]}")
                 vars(model).pop("objective")
                 vars(model.policy).pop("after_gradient_step", None)
-                model.save(folder / "saved")
-                if not is_finite(folder / "saved.zip", kind):
-                    wrong.append(f"{name}: NaN in the file")
-    must = "every one stopped with an error that names it, saved files finite"
+                try:
+                    model.save(folder / "saved")
+                    if not is_finite(folder / "saved.zip", kind):
+                        wrong.append(f"{name}: NaN in the file")
+                except FloatingPointError:  # an update has spoilt the model, which is refused
+                    if is_outside:
+                        wrong.append(f"{name}: the step was refused, but so is the model")
+    must = "every one stopped with an error that names it, none saved"
     return Finding(f"NaN at {count} places", must, f"{count - len(wrong)} stopped", not wrong, tuple(wrong))
