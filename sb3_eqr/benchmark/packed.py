@@ -9,10 +9,10 @@ import pathlib
 import re
 from typing import Any
 
-from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
-from sb3_eqr.benchmark.suites import Evaluation, Suite, merge, read_suite
+from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, read_suite
 from sb3_eqr.common.saving.files import atomic_write
 
 SUFFIX = ".jsonl.xz"
@@ -77,7 +77,7 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
             with lzma.open(path, "rt", encoding="utf-8") as lines:
                 first, *rows = [json.loads(line) for line in lines]
             for row in rows:
-                Row.model_validate(row)
+                check_row(row)
             return Suite.model_validate(first["suite"]), rows
         except (lzma.LZMAError, EOFError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
@@ -90,10 +90,18 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
     return read_suite(path / SUITE), [_read_row(files[folder]) for folder in sorted(files)]
 
 
+def check_row(row: Any) -> None:
+    """Raise ValueError, which names the first mistake, if this is not a row of a run."""
+    try:
+        Row.model_validate(row)
+    except ValidationError as error:
+        raise ValueError(first_mistake(error).removesuffix(".")) from error
+
+
 def _read_row(path: pathlib.Path) -> dict[str, Any]:
     try:
         row = json.loads(path.read_text(encoding="utf-8"))
-        Row.model_validate(row)
+        check_row(row)
         return row
     except (ValueError, RecursionError) as error:
         raise ValueError(

@@ -150,10 +150,10 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     try:
         return Suite.model_validate({"name": name} | entry)
     except ValidationError as error:
-        raise ValueError(f"{where}: {_first_mistake(error)}") from error
+        raise ValueError(f"{where}: {first_mistake(error)}") from error
 
 
-def _first_mistake(error: ValidationError) -> str:
+def first_mistake(error: ValidationError) -> str:
     """:return: the first mistake in words: the key, what it must be, and its value"""
     mistakes = error.errors(include_url=False)  # a misspelt key is also missing: its name says more
     mistake = next((one for one in mistakes if one["type"] == "extra_forbidden"), mistakes[0])

@@ -282,13 +282,16 @@ def shortened(monkeypatch, tmp_path):
 
 
 def write_a_benchmark(folder):
-    """One finished run, with the fields that ``load_scores`` reads."""
+    """One finished run, with the fields that a report reads."""
+    suite = load_suite("smoke")
     evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
     training = {"step": [100], "score": [100.0], "length": [100]}
-    names, others = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0}, {"protocol": {}, "entry": {}, "losses": []}
+    names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0, "suite": "smoke", "command": "", "started": "today"}
+    others = {"protocol": suite.protocol("CartPole-v1"), "entry": {}, "losses": [], "resumed_at": [], "machine": {}}
+    others |= {"attempts": 1, "wall_clock_s": 1.0, "steps_per_second": 1.0}
     run = folder / "runs" / "eqr_qrdqn" / "CartPole-v1" / "0"
     run.mkdir(parents=True)
-    write_suite(load_suite("smoke"), folder / "suite.yml")
+    write_suite(suite, folder / "suite.yml")
     (run / "result.json").write_text(json.dumps({**names, **others, "evaluations": [evaluation], "training": training}))
 
 
