@@ -79,7 +79,6 @@ def test_every_policy_runs_and_all_parameters_are_trained(make, policy, network)
     ],
     ids=lambda kwargs: re.sub(" at 0x\\w+", "", str(kwargs)),
 )
-@EITHER
 def test_every_option_runs(make, kwargs):
     model = make(ChainEnv(), **kwargs).learn(62)
     assert model._n_updates > 0
