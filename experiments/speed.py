@@ -45,7 +45,7 @@ from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
 TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
-N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others: they begin with the backup that is made every 50 updates
+N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others that warm up
 N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
 NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
