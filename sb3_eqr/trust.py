@@ -84,7 +84,8 @@ def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None
     :raises ValueError: if creating the environment from them would import or evaluate code outside ``WRAPPERS`` and
         ``packages``
     """
-    arguments, config = read_plain(folder / "args.yml"), read_plain(folder / "config.yml")
+    files = (folder / "args.yml", folder / "config.yml")
+    arguments, config = (read_plain(file) if file.is_file() else {} for file in files)  # RL Zoo reads what is there
     package, colon, _ = str(arguments.get("env")).partition(":")
     named = [*map(str, arguments.get("gym_packages") or []), *([package] if colon else [])]
     for key in ("env_wrapper", "vec_env_wrapper"):
@@ -106,7 +107,7 @@ def is_plain(expression: str) -> bool:
     """Whether evaluating a string gives a value made of numbers, strings and containers, and calls nothing but ``dict``."""
     try:
         nodes = list(ast.walk(ast.parse(expression, mode="eval")))
-    except SyntaxError:
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # from null bytes and from depth
         return False
     calls = [node.func for node in nodes if isinstance(node, ast.Call)]
     names = [node.id for node in nodes if isinstance(node, ast.Name)]

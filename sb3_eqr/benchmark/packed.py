@@ -9,7 +9,7 @@ import pathlib
 import re
 from typing import Any
 
-from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import BaseModel, ConfigDict, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
 from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, read_suite
@@ -19,7 +19,13 @@ SUFFIX = ".jsonl.xz"
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
 
 
-class Evaluated(BaseModel):
+class Checked(BaseModel):
+    """A model that rejects values of another type; more keys are legal."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class Evaluated(Checked):
     """One evaluation: ``kind`` is "curve" or "final"; scores and lengths of its episodes."""
 
     step: NonNegativeInt
@@ -28,7 +34,7 @@ class Evaluated(BaseModel):
     lengths: list[NonNegativeInt]
 
 
-class Trained(BaseModel):
+class Trained(Checked):
     """The episodes of training: the step at which each ended, its score and length."""
 
     step: list[NonNegativeInt]
@@ -36,7 +42,7 @@ class Trained(BaseModel):
     length: list[NonNegativeInt]
 
 
-class Protocol(BaseModel):
+class Protocol(Checked):
     """How the game was played."""
 
     env_id: str
@@ -45,7 +51,7 @@ class Protocol(BaseModel):
     evaluation: Evaluation
 
 
-class Row(BaseModel):
+class Row(Checked):
     """What a report needs of a run; rows have more."""
 
     agent: str

@@ -229,7 +229,7 @@ def check_trained(args: argparse.Namespace) -> None:
             found = f"Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
         fail(f"{error}. {found}")
     beside = pathlib.Path(folder, EnvironmentName(args.env))
-    if args.algo in AGENTS and not args.trust and (beside / "args.yml").is_file():
+    if args.algo in AGENTS and not args.trust:
         check_files(lambda: check_zoo_folder(beside, args.gym_packages))
 
 

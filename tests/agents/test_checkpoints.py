@@ -11,11 +11,12 @@ from gymnasium import spaces
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
 import sb3_eqr
-from sb3_eqr import EqRQRDQN, EqRRainbow, envs
+from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, envs
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
+from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.toys import ChainEnv
 
@@ -248,6 +249,37 @@ def test_inside_another_callback_it_refuses_to_do_nothing(tmp_path):
         model.learn(60, EveryNTimesteps(20, ExactCheckpointCallback(20, tmp_path)))
     model.learn(60, CallbackList([ExactCheckpointCallback(20, tmp_path)]))
     assert find_checkpoints(tmp_path)
+
+
+def test_a_run_with_arrays_among_its_arguments_goes_on_in_its_folder(tmp_path):
+    """JSON has no tuples, such as the shapes of arrays: the settings must be the same before and after."""
+    turn = [[[0.0, 1.0], [-1.0, 0.0]]]
+    settings = {**SMALL, "symmetry_coef": 0.0, "policy_kwargs": {**SMALL["policy_kwargs"], "group": MatrixLieGroup(turn)}}
+    EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(60, ExactCheckpointCallback(50, tmp_path))
+    model = EqRQRDQN.resume(tmp_path, ChainEnv())
+    model.learn(60, ExactCheckpointCallback(50, tmp_path), reset_num_timesteps=False)
+    assert len(find_checkpoints(tmp_path)) == 2
+
+
+def cartpoles():
+    return make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
+
+
+def test_environments_in_other_processes_are_resumed_exactly(tmp_path):
+    env = cartpoles()
+    whole = EqRQRDQN("MlpPolicy", env, **SMALL).learn(120, ExactCheckpointCallback(60, tmp_path, keep=1))
+    env.close()
+    env = cartpoles()
+    resumed = EqRQRDQN.resume(tmp_path, env)
+    assert 60 <= resumed.num_timesteps < 120
+    resumed.learn(120 - resumed.num_timesteps, reset_num_timesteps=False)
+    env.close()
+    mine, other = resumed.policy.state_dict(), whole.policy.state_dict()
+    assert resumed._n_updates == whole._n_updates > 20 and all(th.equal(mine[key], other[key]) for key in other)
+    bare = make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv)
+    with pytest.raises(ValueError, match=r"env must be Monitor in .*got SubprocVecEnv: the environment is not built as in"):
+        EqRQRDQN.resume(tmp_path, bare)
+    bare.close()
 
 
 def test_stock_agents_cannot_resume(tmp_path):

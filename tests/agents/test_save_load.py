@@ -514,3 +514,12 @@ def test_moments_of_another_shape_are_refused(make):
         model.set_parameters(parameters)
     assert all(th.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
     model.learn(4, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("optimizer", ["Adafactor", "SGD", "RMSprop", "Adagrad"])
+def test_moments_of_other_optimizers_are_loaded(optimizer, tmp_path):
+    """Those of Adafactor have not the shape of their parameter."""
+    model = MAKERS[1](ChainEnv(), policy_kwargs={"optimizer_class": optimizer}).learn(46)
+    model.save(tmp_path / "model")
+    loaded = MAKERS[1].algorithm.load(tmp_path / "model", ChainEnv())
+    assert len(loaded.policy.optimizer.state) == len(model.policy.optimizer.state)

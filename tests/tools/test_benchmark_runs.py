@@ -520,4 +520,6 @@ def test_models_of_runs_without_wrappers_are_saved_without_them(tmp_path):
     execute(run, Settings(save_models=True))
     folder = next(run.folder.glob("models/dqn/*/CartPole-v1"))
     hyperparams, stats = get_saved_hyperparams(str(folder))
-    create_test_env("CartPole-v1", 1, stats, 0, hyperparams=hyperparams, vec_env_cls=DummyVecEnv, should_render=False).close()
+    env = create_test_env("CartPole-v1", 1, stats, 0, hyperparams=hyperparams, vec_env_cls=DummyVecEnv, should_render=False)
+    assert env.observation_space.shape == (4,) and not isinstance(env, VecFrameStack)
+    env.close()

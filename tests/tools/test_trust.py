@@ -135,3 +135,13 @@ def test_plain_expressions(text):
 @pytest.mark.parametrize("text", [TOUCH, "dict(a=dict)", "dict.__class__", "[x for x in dict()]", "print(1)", "(", "nn.ReLU"])
 def test_other_expressions(text):
     assert not is_plain(text)
+
+
+@pytest.mark.parametrize("missing", ["args.yml", "config.yml"])
+def test_one_file_alone_is_checked(hostile, command, missing, tmp_path):
+    """RL Zoo reads each of them without the other."""
+    beside = hostile(**SETTINGS[3]) / "CartPole-v1"
+    (beside / missing).unlink()
+    if missing == "config.yml":
+        (beside / "args.yml").write_text("!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [ran]]")
+    assert not ran(command, f"enjoy --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render")

@@ -93,9 +93,7 @@ class FiniteData(OffPolicyAlgorithm):
             self._last_obs = None  # the environment has already stepped, so the next call of learn must reset it
             for part, saved in zip(_running_means(self._vec_normalize_env), self._statistics, strict=True):
                 vars(part).update(saved)
-            raise ValueError(
-                f"step {self.num_timesteps}: {error} The model is unchanged. SB3's VecCheckNan shows which action caused it."
-            ) from error
+            raise ValueError(f"step {self.num_timesteps}: {error}") from error
         self._statistics = [dict(vars(part)) for part in _running_means(self._vec_normalize_env)]
 
     def predict(

@@ -64,7 +64,9 @@ def check_transition(action_space: spaces.Space, obs: Any, next_obs: Any, action
     """Raise ValueError if a transition has an invalid action, a number that is not finite, or an unclear end."""
     for what, values in (("obs", obs), ("next_obs", next_obs), ("reward", reward)):
         if (found := find_infinite(values)) is not None:
-            raise ValueError(f"{what} must be finite, got {found}. Nothing was stored.")
+            raise ValueError(
+                f"{what} must be finite, got {found}. Nothing was stored. SB3's VecCheckNan shows which action caused it."
+            )
     actions, n_actions = np.asarray(action), int(getattr(action_space, "n", 0))
     if n_actions and not ((actions >= 0) & (actions < n_actions)).all():  # NaN is neither
         raise ValueError(f"action must be integers in [0, {n_actions - 1}], got {actions.tolist()}. Nothing was stored.")
@@ -275,11 +277,15 @@ def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> No
             )
 
 
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "sum")  # of PyTorch's fused optimisers
+
+
 def check_moments(optimizer: th.optim.Optimizer) -> None:
-    """Raise ValueError if a loaded moment has not the shape and kind of its parameter: fused Adam would write beyond it."""
+    """Raise ValueError if a loaded moment has not its parameter's shape and kind: a fused kernel would write beyond it."""
     for parameter, state in optimizer.state.items():
-        for name, value in state.items():
-            if not isinstance(value, th.Tensor) or value.ndim == 0:
+        for name in MOMENTS:
+            value = state.get(name)
+            if not isinstance(value, th.Tensor):
                 continue
             if value.shape != parameter.shape or value.is_floating_point() != parameter.is_floating_point():
                 raise ValueError(

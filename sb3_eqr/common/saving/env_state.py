@@ -121,7 +121,7 @@ def capture(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
     parts: list[Any] = [[_name(wrapper), _state_of(wrapper)] for wrapper in wrappers]
     if isinstance(innermost, DummyVecEnv):
         envs = [_captured_env(one) for one in innermost.envs]
-    elif isinstance(innermost, SubprocVecEnv) and innermost.has_attr("captured"):
+    elif isinstance(innermost, SubprocVecEnv) and all(innermost.env_is_wrapped(ResumableWrapper)):
         envs = innermost.env_method("captured")
     else:
         envs = [[[_name(innermost), None]]]
@@ -138,8 +138,9 @@ def restore(env: VecEnv, state: dict[str, Any], wrappers_only: bool) -> None:
     """
     wrappers, innermost = _split(env)
     try:
-        expected = [*(name for name, _ in state["wrappers"]), state["innermost"]]
-        _check_built(expected, [_name(part) for part in [*wrappers, innermost]])
+        now, _ = capture(env)
+        for there, here in ((state, now), *([] if wrappers_only else zip(state["envs"], now["envs"], strict=False))):
+            _check_built(_names(there), _names(here))
         for wrapper, (_, found) in zip(wrappers, state["wrappers"], strict=True):
             _restore(wrapper, found)
         if wrappers_only:
@@ -151,7 +152,7 @@ def restore(env: VecEnv, state: dict[str, Any], wrappers_only: bool) -> None:
                 _restore_env(innermost.envs[i], found)
             else:
                 innermost.env_method("restore", found, indices=i)
-    except (KeyError, TypeError, AttributeError, OverflowError, RuntimeError, SystemError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError, RuntimeError, SystemError, EOFError) as error:
         raise ValueError(f"The environment's state must be one written by a checkpoint, got {error!r}.") from error
 
 
@@ -177,9 +178,14 @@ def _captured_env(env: gym.Env) -> list[Any]:
 
 def _restore_env(env: gym.Env, state: list[Any]) -> None:
     layers = [layer for layer in _layers(env) if not isinstance(layer, ResumableWrapper)]
-    _check_built([name for name, _ in state], [_name(layer) for layer in layers])
     for layer, (_, found) in zip(layers, state, strict=True):
         _restore(layer, found)
+
+
+def _names(state: Any) -> list[str]:
+    """The classes in a state, of all vectorised wrappers or of one environment, from the outside."""
+    parts = [*state["wrappers"], [state["innermost"], None]] if isinstance(state, dict) else state
+    return [name for name, _ in parts]
 
 
 def _check_built(expected: list[str], found: list[str]) -> None:

@@ -99,8 +99,8 @@ def data_of(content: bytes) -> dict[str, Any]:
 
 class LimitedMemory(TorchDispatchMode):
     """
-    Raises ValueError when tensors of more than ``n_bytes`` have been created: a file is not larger than the agent that it
-    describes.
+    Raises ValueError when new tensors would take more than ``n_bytes``: a file holds all parameters of the agent that it
+    describes, so it cannot be much smaller.
     """
 
     def __init__(self, n_bytes: int):

@@ -74,7 +74,12 @@ def _encode_container(value: Any) -> Any:
 def _encode_array(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biufcSUMm":
         data = base64.b64encode(value.tobytes()).decode()
-        return {KIND: "scalar" if value.ndim == 0 else "array", "dtype": value.dtype.str, "shape": value.shape, "data": data}
+        return {
+            KIND: "scalar" if value.ndim == 0 else "array",
+            "dtype": value.dtype.str,
+            "shape": list(value.shape),
+            "data": data,
+        }
     if isinstance(value, th.dtype):
         return {KIND: "dtype", "name": str(value).removeprefix("torch.")}
     if isinstance(value, th.device):
