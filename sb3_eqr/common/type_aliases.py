@@ -16,7 +16,7 @@ class SequenceReplayBufferSamples(NamedTuple):
     """
 
     observations: PyTorchObs  # (B, *obs_shape): s_t
-    actions: th.Tensor  # (B, 1), int64: a_t
+    actions: th.Tensor  # a_t: (B, 1), int64, or (B, action_dim) for Box actions
     next_observations: PyTorchObs  # (B, *obs_shape): the last observation of the n-step transition
     dones: th.Tensor  # (B, 1): 1 where that transition ended in a terminal state; 0 for time-outs
     rewards: th.Tensor  # (B, 1): the discounted n-step return
@@ -24,6 +24,6 @@ class SequenceReplayBufferSamples(NamedTuple):
     indices: np.ndarray  # (B,), int64: leaves of the sum tree, position * n_envs + environment
     weights: th.Tensor  # (B,): importance weights, 1 for uniform replay
     rollout_observations: PyTorchObs | None = None  # (B, M, *obs_shape): s_{t+1} ... s_{t+M}
-    rollout_actions: th.Tensor | None = None  # (B, M), int64: a_t ... a_{t+M-1}
+    rollout_actions: th.Tensor | None = None  # a_t ... a_{t+M-1}: (B, M), int64, or (B, M, action_dim) for Box actions
     rollout_rewards: th.Tensor | None = None  # (B, M): r_{t+1} ... r_{t+M}, one-step rewards
     mask: th.Tensor | None = None  # (B, M): 1 where the episode had not ended before step t+m

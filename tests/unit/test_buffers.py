@@ -14,6 +14,7 @@ from sb3_eqr.common.replay import buffers
 from sb3_eqr.common.replay.frame_store import FrameStore
 
 ACTIONS = spaces.Discrete(4)
+FORCES = spaces.Box(-1, 1, (2,), np.float32)
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 IMAGES = spaces.Box(0, 255, (4, 6, 5), np.uint8)
 BOTH = pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
@@ -22,8 +23,8 @@ BOTH = pytest.mark.parametrize("buffer_class", [SequenceReplayBuffer, Prioritize
 class Stream:
     """Random episodes in several environments, recorded completely and simply, to compare buffers with."""
 
-    def __init__(self, space, n_envs, seed=0, padding="zero", mean_length=6, channels=1):
-        self.space, self.n_envs, self.padding, self.mean_length = space, n_envs, padding, mean_length
+    def __init__(self, space, n_envs, seed=0, padding="zero", mean_length=6, channels=1, actions=ACTIONS):
+        self.space, self.n_envs, self.padding, self.mean_length, self.actions = space, n_envs, padding, mean_length, actions
         self.channels = channels  # per frame
         self.rng = np.random.default_rng(seed)
         self.steps = []  # one dict of arrays per call of add
@@ -33,6 +34,11 @@ class Stream:
         if self.space is IMAGES:
             return self.rng.integers(0, 256, (self.channels, 6, 5), dtype=np.uint8)
         return self.rng.normal(size=3).astype(np.float32)
+
+    def action(self):
+        if self.actions is FORCES:
+            return self.rng.uniform(-1, 1, (self.n_envs, 2)).astype(np.float32)
+        return self.rng.integers(0, 4, self.n_envs)
 
     def first(self):
         if self.space is not IMAGES:
@@ -52,7 +58,7 @@ class Stream:
             step = {
                 "obs": self.obs,
                 "next_obs": next_obs,
-                "action": self.rng.integers(0, 4, self.n_envs),
+                "action": self.action(),
                 "reward": self.rng.normal(size=self.n_envs).astype(np.float32),
                 "done": done,
                 "infos": [{"TimeLimit.truncated": bool(t)} for t in timeout],
@@ -75,7 +81,7 @@ class Stream:
         steps = taken[:n]
         expected = {
             "observations": taken[0]["obs"][env],
-            "actions": [taken[0]["action"][env]],
+            "actions": np.atleast_1d(taken[0]["action"][env]),
             "next_observations": steps[-1]["next_obs"][env],
             "dones": [float(steps[-1]["done"][env] and not steps[-1]["timeout"][env])],
             "rewards": [sum(gamma**k * float(s["reward"][env]) for k, s in enumerate(steps))],
@@ -90,13 +96,14 @@ class Stream:
         return expected
 
 
+@pytest.mark.parametrize("actions", [ACTIONS, FORCES], ids=["Discrete", "Box"])
 @pytest.mark.parametrize("n_steps", [1, 3, 7])
 @pytest.mark.parametrize("n_envs, n_adds", [(1, 30), (1, 97), (3, 97)])
-def test_without_rollout_it_equals_sb3s_n_step_buffer(n_steps, n_envs, n_adds):
+def test_without_rollout_it_equals_sb3s_n_step_buffer(n_steps, n_envs, n_adds, actions):
     """Every field of every sample, before and after wrap-around, with time-outs."""
-    stream = Stream(VECTOR, n_envs)
-    theirs = NStepReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
-    ours = SequenceReplayBuffer(40 * n_envs, VECTOR, ACTIONS, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
+    stream = Stream(VECTOR, n_envs, actions=actions)
+    theirs = NStepReplayBuffer(40 * n_envs, VECTOR, actions, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
+    ours = SequenceReplayBuffer(40 * n_envs, VECTOR, actions, "cpu", n_envs, n_steps=n_steps, gamma=0.9)
     stream.feed(n_adds, theirs, ours)
     for seed in range(20):
         np.random.seed(seed)
@@ -135,16 +142,19 @@ RINGS = [(3, 101), (1, 25)]  # environments and steps: one buffer is overwritten
 # Every kind of stack with the first window and ring; two kinds with all windows and rings.
 CASES = [(*stack, *WINDOWS[0], *RINGS[0]) for stack in STACKS[2:]]
 CASES += [(*stack, *window, *ring) for stack in STACKS[:2] for window in WINDOWS for ring in RINGS]
+CASES = [(ACTIONS, *case) for case in CASES] + [(FORCES, *STACKS[0], *WINDOWS[0], *ring) for ring in RINGS]
 
 
 @BOTH
-@pytest.mark.parametrize("space, frame_stack, padding, n_steps, depth, n_envs, n_adds", CASES)
-def test_every_sample_matches_what_was_added(buffer_class, space, frame_stack, padding, n_steps, depth, n_envs, n_adds):
-    stream = Stream(space, n_envs, padding=padding, mean_length=5, channels=4 // frame_stack)
+@pytest.mark.parametrize("actions, space, frame_stack, padding, n_steps, depth, n_envs, n_adds", CASES)
+def test_every_sample_matches_what_was_added(
+    buffer_class, actions, space, frame_stack, padding, n_steps, depth, n_envs, n_adds
+):
+    stream = Stream(space, n_envs, padding=padding, mean_length=5, channels=4 // frame_stack, actions=actions)
     buffer = buffer_class(
         30 * n_envs,
         space,
-        ACTIONS,
+        actions,
         "cpu",
         n_envs,
         n_steps=n_steps,

@@ -35,7 +35,7 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     :param buffer_size: number of transitions, over all environments; per environment at least n + M + 1
     :param observation_space: any space that SB3 supports
-    :param action_space: Discrete
+    :param action_space: Discrete, or Box
     :param device: device of the samples
     :param n_envs: number of parallel environments
     :param optimize_memory_usage: ignored, because the memory usage is always optimised
@@ -249,9 +249,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         mask = steps[:depth] <= first_end[:, None]  # (B, M)
         # Beyond the end, repeat the last transition, so that no data of another episode get in, masked or not.
         rollout = (positions[:, None] + np.minimum(steps[:depth], first_end[:, None])) % self.buffer_size
+        actions = self.actions[rollout, columns]  # (B, M, action_dim)
         return samples._replace(
             rollout_observations=self._observations(rollout, columns, env, following=True),
-            rollout_actions=self._tensor(self.actions[rollout, columns, 0]),
+            rollout_actions=self._tensor(actions[..., 0] if isinstance(self.action_space, spaces.Discrete) else actions),
             rollout_rewards=self._tensor((rewards[:, :depth] * mask).astype(np.float32, copy=False)),
             mask=self._tensor(mask.astype(np.float32)),
         )
