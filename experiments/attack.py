@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import torch as th
 
-from experiments.attacks import Finding, command_lines, files, inputs, kills, numbers
+from experiments.attacks import Finding, command_lines, files, inputs, kills, numbers, resumes
 
 
 def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Callable[[], Finding]]]:
@@ -33,6 +33,7 @@ def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Cal
             lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=2),
             lambda: kills.killed_benchmark(folder / "benchmark", n_kills, rng),
         ],
+        "resumes": [lambda: resumes.resumed_runs(folder / "resumed")],
         "inputs": [
             inputs.wrong_arguments,
             inputs.without_asserts,
