@@ -15,11 +15,10 @@ from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
-from sb3_eqr.visualize.latents import Play, encode, play
+from sb3_eqr.visualize.latents import Play, encode, names_of_factors, play
 from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictures
 from sb3_eqr.visualize.tables import all_tables, write_tables
-from sb3_eqr.visualize.tables import factor_names as all_names
 
 DEPTH = 5  # for agents without latent losses
 FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # argument of play -> flag
@@ -88,7 +87,7 @@ def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str], period
     states = encode(model, played.samples.observations)
     if played.factors is None:
         return {"latents": latent_figure(model, states)}
-    names = all_names(played.factors.shape[1], factors)
+    names = names_of_factors(played.factors.shape[1], factors)
     return {
         f"latents_{name.replace(' ', '_')}": latent_figure(model, states, values, name, name.split(" ")[0] in periodic)
         for name, values in zip(names, played.factors.T, strict=True)
