@@ -122,8 +122,8 @@ def train_representation(
     :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), as in Example 2; latent angles are then linear in
         the true positions
     :param still_timesteps: number of steps after ``learning_starts`` in which actions stay the identity, so that slow features
-        are learned first (:class:`StillActions`): one turn around a loop instead of two, one axis instead of a mixture. 0: κ is
-        trained from the start, near the identity
+        are learned first (:class:`StillActions`): one turn around a loop instead of two, one axis instead of a mixture. 0: κ
+        is trained from the start, near the identity
     :param policy_kwargs: additional arguments of the policy
     :param callback: as for ``learn``
     :param progress_bar: as for ``learn``
@@ -154,10 +154,11 @@ def train_representation(
         device=device,
         **AGENT,
     )
-    given = callback if isinstance(callback, list) else [] if callback is None else [callback]
-    callbacks = [one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given]
-    still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
-    model.learn(total_timesteps, callback=[*still, *callbacks], progress_bar=progress_bar)
+    given = callback if isinstance(callback, list) else [callback]
+    callbacks = [one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given if one is not None]
+    if still_timesteps > 0:
+        callbacks.insert(0, StillActions(learning_starts + still_timesteps))
+    model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
     if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback stopped training at once
         _tell(model, {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True})
     return model
