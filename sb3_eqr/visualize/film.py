@@ -115,11 +115,9 @@ def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deter
     """Run the agent; parameters as in :func:`record`. Seeds the global generators."""
     env = latents.as_vec_env(model, env)
     for what in ("observation_space", "action_space"):
-        if getattr(env, what) != getattr(model, what):
-            raise ValueError(
-                f"env must have the agent's {what} {getattr(model, what)}, got {getattr(env, what)}. "
-                "Wrap the environment as in training."
-            )
+        wanted, got = getattr(model, what), getattr(env, what)
+        if got != wanted:
+            raise ValueError(f"env must have the agent's {what} {wanted}, got {got}. Wrap the environment as in training.")
     normalize, obs = unwrap_vec_normalize(env), latents.reset(model, env, seed)
     rows, pictures, actions, rewards, starts = [], [], [], [], [0]
     for t in range(n_steps):
@@ -208,17 +206,13 @@ def _extent(values: np.ndarray) -> float:
     """The half width that the true states need, or 98 % of the predictions, unless these are too far out."""
     needed, ghosts = max(float(np.abs(values[0]).max()), 1e-6), np.abs(values[1][np.isfinite(values[1])])
     wanted = float(np.quantile(ghosts, 0.98)) if len(ghosts) else 0.0
-    return max(needed, wanted) if wanted <= GHOST_ROOM * needed else needed
+    return wanted if needed < wanted <= GHOST_ROOM * needed else needed
 
 
 class Painter:
     """
-    Draws the frames of one film.
-
-    :param panels: one per block
-    :param starts: the frame at which each frame's episode began, (T,)
-    :param depth: M, for the legend
-    :param about: description of the agent, at the bottom
+    Draws the frames of one film: a panel per block, and an image of the environment. ``starts`` has the frame at which each
+    frame's episode began, (T,); the legend has M, ``depth``, and the line at the bottom is ``about``.
     """
 
     def __init__(self, panels: Sequence[Panel], starts: np.ndarray, depth: int, about: str):
@@ -325,9 +319,9 @@ class Painter:
 def moved(panel: Panel, which: int, t: int, artists: dict[str, Any]) -> list[Any]:
     """The artists to draw at step t: none without a prediction, a triangle at the edge for a block beyond it."""
     arrows, at = (None if part is None else part[which, t] for part in (panel.arrows, panel.dots))
-    if not all(part is None or np.isfinite(part).all() for part in (arrows, at)):
-        return []
     foot = np.zeros(2) if at is None else at
+    if not np.isfinite(foot if arrows is None else foot + arrows).all():
+        return []
     if np.abs(foot).max() > 1:
         artists["beyond"].set_data(*(0.95 * foot / np.abs(foot).max())[:, None])
         artists["beyond"].set_marker((3, 0, round(np.degrees(np.arctan2(foot[1], foot[0]))) - 90))  # its tip outwards

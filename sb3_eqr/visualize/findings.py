@@ -66,11 +66,8 @@ class Collapse(NamedTuple):
 
 def find_motion(model: EqRAlgorithm, data: latents.Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
     """
-    Distances in the block rather than sizes of κ: they are defined for every group, including "none", and have the units of
-    the transition error.
-
-    :param states: (n, D)
-    :param elements: κ of every action in these states, (n, A, D)
+    Motion by the elements κ of every action, (n, A, D), in states, (n, D). Distances in the block rather than sizes of κ: they
+    are defined for every group, including "none", and have the units of the transition error.
     """
     latent_model = latents.group_model(model)
     n_actions = latent_model.action_dim
@@ -99,14 +96,11 @@ def find_disentanglement(
     model: EqRAlgorithm, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
 ) -> Disentanglement:
     """
-    A block's information about a factor is that of its rotation or of its translation, whichever is larger; either is a lower
-    bound on the block's.
-
-    :param states: (N, D)
-    :param factors: (N, F), if known
+    Of states, (N, D), and true factors, (N, F), if known. A block's information about a factor is that of its rotation or of
+    its translation, whichever is larger; either is a lower bound on the block's.
     """
-    vectors = np.concatenate([part.mean.reshape(len(part.mean), -1) for part in generators], axis=1)  # (A, ...)
-    opposites = measures.opposites(vectors)
+    means = [part.mean.reshape(len(part.mean), -1) for part in generators]
+    opposites = measures.opposites(np.concatenate(means, axis=1))
     blocks = latents.each_block(model, states)
     redundancy = measures.canonical_correlations([block.flatten(1) for *_, block in blocks])
     information = gap = None
@@ -126,11 +120,7 @@ def _information(parts: list[np.ndarray], factor: np.ndarray) -> float:
 
 
 def find_action_symmetry(model: EqRAlgorithm, data: latents.Latents, rng: np.random.Generator) -> ActionSymmetry | None:
-    """
-    The effect of ρ in Eq. 19, computed with the online networks only.
-
-    :param rng: generator that draws each state's partner
-    """
+    """The effect of ρ in Eq. 19, computed with the online networks only; ``rng`` draws each state's partner."""
     latent_model, n = latents.group_model(model), len(data.states)
     group = latent_model.group
     if not group.has_inverse or n < 2:

@@ -214,22 +214,15 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     mask = samples.mask.to(model.device)
     actions = (samples.rollout_actions.to(model.device) * mask.long()).long()
     states = encode(model, samples.observations)
-    following = encode(model, flat(samples.rollout_observations))
-    latent_model = model.policy.latent_model
+    following = encode(model, flat(samples.rollout_observations))  # (N * M, D)
+    rewards, latent_model = samples.rollout_rewards.to(model.device), model.policy.latent_model
     with th.no_grad(), eval_mode(model):
         predicted = latent_model.rollout(states, model.policy.embed_actions(actions))
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
-    return Latents(
-        states,
-        following.unflatten(0, mask.shape),
-        predicted,
-        outputs.view(mask.shape),
-        actions,
-        samples.rollout_rewards.to(model.device),
-        mask,
-    )
+    following = following.unflatten(0, mask.shape)
+    return Latents(states, following, predicted, outputs.view(mask.shape), actions, rewards, mask)
 
 
 def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:

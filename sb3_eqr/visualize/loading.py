@@ -156,10 +156,7 @@ def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> V
 
 
 def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
-    """
-    :param pairs: "key:value", where the value is a Python literal or a string
-    :raises ValueError: for another format
-    """
+    """Arguments from pairs "key:value", where the value is a Python literal or a string; others raise a ValueError."""
     found = {}
     for pair in pairs:
         key, colon, value = pair.partition(":")

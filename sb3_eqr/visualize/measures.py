@@ -55,11 +55,8 @@ def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Te
 
 def reward_error(predicted: th.Tensor, rewards: th.Tensor, mask: th.Tensor) -> Rewards:
     """
-    Reward prediction compared with the constant mean; the explained variance is defined as in SB3.
-
-    :param predicted: (N, M)
-    :param rewards: (N, M)
-    :param mask: (N, M), 1 where the window counts
+    Reward prediction, (N, M), compared with the constant mean, where the mask, (N, M), is 1; the explained variance is defined
+    as in SB3.
     """
     errors = [(true - guess, true) for guess, true in _valid(mask, predicted, rewards)]  # (n,) each
     rows = [(float(error.square().mean()), float(_variance(true)), float(_variance(error))) for error, true in errors]

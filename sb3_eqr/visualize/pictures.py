@@ -1,7 +1,4 @@
-"""
-Figures of the diagnostics, at 6×4 inches. They need no display, and do not use matplotlib's ``pyplot``, so they need not be
-closed.
-"""
+"""Figures, at 6×4 inches. They need no display, and do not use matplotlib's ``pyplot``, so they need not be closed."""
 
 import pathlib
 from collections.abc import Sequence
@@ -26,13 +23,10 @@ from sb3_eqr.visualize.latents import each_block, frame, names_of_factors
 from sb3_eqr.visualize.measures import ROUNDING, Transition
 
 SIZE, DPI = (6.0, 4.0), 150  # SIZE: inches
-MAX_PANELS = 12
-MAX_POINTS = 400
-MAX_ARROWS = 150
+MAX_PANELS, MAX_POINTS, MAX_ARROWS = 12, 400, 150  # of the latent states; MAX_PANELS also of the generators
 ABOUT = "A point per state: a block's translation, an arrow for its rotation, or its principal components."
 MAX_COORDINATES = 6  # of a block, in one panel
-MAX_NUMBERS = 36  # printed in a heat map
-MAX_NUMBER_COLUMNS = 6  # with more, the numbers would overlap
+MAX_NUMBERS, MAX_NUMBER_COLUMNS = 36, 6  # printed in a heat map; with more columns, the numbers would overlap
 PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # instead of powers of ten
 COORDINATES = {"angle": "angle in a plane (radians)", "a": "matrix entry a", "t": "translation t", "x": "entry x"}
 MAX_LETTERS = 72  # of horizontal tick labels at the bottom of a figure
@@ -175,10 +169,10 @@ def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()
     axes[0].set_yticks(axes[0].get_xticks())
     axes[0].set_ylabel("block")
     if found.information is not None:
-        names = names_of_factors(found.information.shape[1], factors)
         _heat_map(axes[1], found.information.T, "information about true factors", 1)
         _block_ticks(axes[1], diagnostics.blocks)
-        axes[1].set_yticks(range(len(names)), names)
+        n_factors = found.information.shape[1]
+        axes[1].set_yticks(range(n_factors), names_of_factors(n_factors, factors))
     label = "0: independent, 1: one determines the other"
     figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60, label=label)
     return figure
@@ -203,12 +197,9 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         ax.yaxis.set_major_formatter(PLAIN)
         ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
-    units = f"{found.dead_units:.0%} of the trunk's {found.n_units} units are constant (dead)"
-    ax.set_title(
-        f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n"
-        f"{units}, {found.dormant_units:.0%} nearly 0 (dormant)",
-        loc="left",
-    )
+    title = f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n{found.dead_units:.0%} of the "
+    title += f"trunk's {found.n_units} units are constant (dead), {found.dormant_units:.0%} nearly 0 (dormant)"
+    ax.set_title(title, loc="left")
     return figure
 
 
@@ -229,11 +220,7 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
 
 
 def latent_figure(
-    model: EqRAlgorithm,
-    states: th.Tensor,
-    values: np.ndarray | None = None,
-    label: str = "time",
-    is_periodic: bool = False,
+    model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", is_periodic: bool = False
 ) -> Figure:
     """
     A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in
@@ -329,5 +316,5 @@ def _roomy(ax: Axes, points: np.ndarray) -> None:
 
 def _outside(ax: Axes, points: ArrayLike) -> str:
     low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
-    count = int(((points < low) | (points > high)).any(axis=1).sum())
+    count = int(((np.asarray(points) < low) | (np.asarray(points) > high)).any(axis=1).sum())
     return f" ({count} outside)" if count else ""
