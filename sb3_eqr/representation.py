@@ -18,7 +18,7 @@ from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
 
 N_WINDOWS = 512  # how many windows are checked for a collapse
-AGENT: dict[str, Any] = {
+AGENT: dict[str, Any] = {  # random actions; no loss but those of the latent model
     "gradient_steps": -1,
     "n_steps": 1,
     "exploration_fraction": 1.0,
@@ -29,7 +29,7 @@ AGENT: dict[str, Any] = {
     "shift_pixels": 0,  # shifts would hide the motion that is to be learned
     "intensity_scale": 0.0,
 }
-NETWORK: dict[str, Any] = {
+NETWORK: dict[str, Any] = {  # unless ``policy_kwargs`` says otherwise
     "projection": "none",
     "predictor": False,
     "layer_norm": False,  # redundant with whitening
