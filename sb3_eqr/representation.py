@@ -17,13 +17,34 @@ from sb3_eqr.eqr_qrdqn import EqRQRDQN
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import replayed
 
-INITIAL_LEARNING_RATE = 1e-3  # decays linearly to 0, so that the last updates add little noise
 N_WINDOWS = 512  # how many windows are checked for a collapse
+AGENT: dict[str, Any] = {  # random actions; no loss but those of the latent model
+    "gradient_steps": -1,
+    "n_steps": 1,
+    "exploration_fraction": 1.0,
+    "exploration_final_eps": 1.0,
+    "td_coef": 0.0,
+    "reward_coef": 0.0,
+    "prioritized_replay": False,
+    "shift_pixels": 0,  # shifts would hide the motion that is to be learned
+    "intensity_scale": 0.0,
+}
+NETWORK: dict[str, Any] = {  # unless ``policy_kwargs`` says otherwise
+    "projection": "none",
+    "predictor": False,
+    "layer_norm": False,  # redundant with whitening
+    "head_input": "state",
+    "latent_tau": None,
+    "noisy": False,
+    "dueling": False,
+    "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's default: the value of Table 5 suppresses small gradients
+}
 
 
 class StillActions(BaseCallback):
     """
-    Start κ at the identity, and keep it there for a while.
+    Start κ at the identity, and keep it there for a while. Slow features are then learned first (slow feature analysis,
+    Wiskott and Sejnowski 2002, https://doi.org/10.1162/089976602317318938).
 
     :param until: number of environment steps after which κ is trained
     """
@@ -82,16 +103,15 @@ def train_representation(
     (``td_coef=0``), which works with ``save``, ``sb3-eqr visualize`` and ``load_representation``; its Q head is untrained.
 
     The defaults are the minimum that recovered the sliding ball's circle and torus (docs/representation.md): whitened latent
-    states with a parameterization without discontinuities, actions fixed to the identity at first, and the contrastive loss.
-    The paper's example as stated (``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``)
-    collapses.
+    states with a parameterization without discontinuities, actions fixed to the identity at first, the contrastive loss. The
+    paper's example as stated (``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``) collapses.
 
     :param env: as for :class:`~sb3_eqr.EqRQRDQN`; several parallel environments cover more states
     :param group: group of the blocks, see :func:`~sb3_eqr.common.groups.make_group`
     :param n_blocks: K; ``None``: as in the policies
     :param total_timesteps: random steps, over all environments; one update per step after ``learning_starts``
     :param policy: "CnnPolicy", "MlpPolicy" or "MultiInputPolicy"
-    :param learning_rate: ``None``: 10⁻³, decaying linearly to 0
+    :param learning_rate: ``None``: 10⁻³, decaying linearly to 0, so that the last updates add little noise
     :param learning_starts: steps before the first update: slow features emerge only from data that cover the environment
     :param batch_size: windows per update; with the contrastive loss, one more than the number of negatives
     :param prediction_depth: M, number of predicted steps
@@ -101,10 +121,9 @@ def train_representation(
     :param whiten: whether to whiten the latent states
     :param state_dependent_actions: ``True``: κ(s, a). ``False``: κ(a), as in Example 2; latent angles are then linear in
         the true positions
-    :param still_timesteps: number of steps after ``learning_starts`` in which actions stay the identity; 0: κ is trained from
-        the start, near the identity. With actions fixed, slow features are learned first (slow feature analysis, Wiskott and
-        Sejnowski 2002, https://doi.org/10.1162/089976602317318938): one turn around a loop instead of two, one axis instead
-        of a mixture
+    :param still_timesteps: number of steps after ``learning_starts`` in which actions stay the identity, so that slow features
+        are learned first (:class:`StillActions`): one turn around a loop instead of two, one axis instead of a mixture. 0: κ
+        is trained from the start, near the identity
     :param policy_kwargs: additional arguments of the policy
     :param callback: as for ``learn``
     :param progress_bar: as for ``learn``
@@ -115,6 +134,37 @@ def train_representation(
     :raises ValueError: if an argument is out of range
     :warns UserWarning: if the representation has collapsed (:func:`~sb3_eqr.visualize.diagnostics.find_verdict`)
     """
+    _check_steps(total_timesteps, learning_starts, still_timesteps)
+    network: dict[str, Any] = {"group": group, "n_blocks": n_blocks, "parameterization": parameterization, "whiten": whiten}
+    network |= {"state_dependent_actions": state_dependent_actions, "aet_loss": aet_loss, **NETWORK}
+    network |= {"features_extractor_class": "flatten"} if policy == "MlpPolicy" else {}
+    model = EqRQRDQN(
+        policy,
+        env,
+        LinearSchedule(1e-3, 0.0, 1.0) if learning_rate is None else learning_rate,
+        buffer_size=total_timesteps,
+        learning_starts=learning_starts,
+        batch_size=batch_size,
+        prediction_depth=prediction_depth,
+        aet_coef=float(prediction_depth),  # makes the AET loss a sum over the steps; the GET loss has one step only
+        symmetry_coef=symmetry_coef,
+        policy_kwargs={**network, **(policy_kwargs or {})},
+        verbose=verbose,
+        seed=seed,
+        device=device,
+        **AGENT,
+    )
+    given = callback if isinstance(callback, list) else [callback]
+    callbacks = [one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given if one is not None]
+    if still_timesteps > 0:
+        callbacks.insert(0, StillActions(learning_starts + still_timesteps))
+    model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
+    if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback stopped training at once
+        _tell(model, {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True})
+    return model
+
+
+def _check_steps(total_timesteps: int, learning_starts: int, still_timesteps: int) -> None:
     check("still_timesteps", still_timesteps, integer(0))
     check("total_timesteps", total_timesteps, integer(1))
     if total_timesteps <= learning_starts + still_timesteps:
@@ -123,54 +173,6 @@ def train_representation(
             f"got {total_timesteps}. Pass more steps, or lower learning_starts (random steps before the first update) or "
             "still_timesteps (steps in which actions stay the identity)."
         )
-    model = EqRQRDQN(
-        policy,
-        env,
-        learning_rate=LinearSchedule(INITIAL_LEARNING_RATE, 0.0, 1.0) if learning_rate is None else learning_rate,
-        buffer_size=total_timesteps,
-        learning_starts=learning_starts,
-        batch_size=batch_size,
-        gradient_steps=-1,
-        n_steps=1,
-        exploration_fraction=1.0,
-        exploration_final_eps=1.0,
-        prediction_depth=prediction_depth,
-        td_coef=0.0,
-        aet_coef=float(prediction_depth),  # makes the AET loss a sum over the steps; the GET loss has one step only
-        symmetry_coef=symmetry_coef,
-        reward_coef=0.0,
-        prioritized_replay=False,
-        shift_pixels=0,  # shifts would hide the motion that is to be learned
-        intensity_scale=0.0,
-        policy_kwargs={
-            "group": group,
-            "n_blocks": n_blocks,
-            "parameterization": parameterization,
-            "whiten": whiten,
-            "state_dependent_actions": state_dependent_actions,
-            "aet_loss": aet_loss,
-            "projection": "none",
-            "predictor": False,
-            "layer_norm": False,  # redundant with whitening
-            "head_input": "state",
-            "latent_tau": None,
-            **({"features_extractor_class": "flatten"} if policy == "MlpPolicy" else {}),
-            "noisy": False,
-            "dueling": False,
-            "optimizer_kwargs": {"eps": 1e-8},  # PyTorch's default: the value of Table 5 suppresses small gradients
-            **(policy_kwargs or {}),
-        },
-        verbose=verbose,
-        seed=seed,
-        device=device,
-    )
-    given = [] if callback is None else callback if isinstance(callback, list) else [callback]
-    still = [StillActions(learning_starts + still_timesteps)] if still_timesteps > 0 else []
-    callbacks = [*still, *(one if isinstance(one, BaseCallback) else ConvertCallback(one) for one in given)]
-    model.learn(total_timesteps, callback=callbacks, progress_bar=progress_bar)
-    if model.replay_buffer is not None and model.replay_buffer.n_starts > 0:  # unless a callback stopped training at once
-        _tell(model, {"whiten=True": not whiten, 'aet_loss="contrastive"': aet_loss != "contrastive", "another group": True})
-    return model
 
 
 def _tell(model: EqRQRDQN, remedies: dict[str, bool]) -> None:

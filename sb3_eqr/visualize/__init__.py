@@ -5,22 +5,15 @@ Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metr
 
 ``__main__`` parses the command line, ``loading`` loads model and environment, ``trust`` checks files from others. ``latents``
 runs the agent and encodes, ``measures`` and ``findings`` compute, ``diagnostics`` collects the metrics and the verdict;
-``tables`` and ``pictures`` write them, ``latent_figure`` plots the states, ``film`` animates them. ``callback`` is for use
-during training.
+``tables`` and ``pictures`` write them, ``film`` animates the states. ``callback`` is for use during training.
 """
 
 import importlib
 from typing import Any
 
+_MODULES = {"Diagnostics": "diagnostics", "LatentCallback": "callback", "diagnose": "diagnostics"}
+_MODULES |= {"play": "latents", "record": "film"}
 __all__ = ["Diagnostics", "LatentCallback", "diagnose", "play", "record"]
-
-_MODULES = {
-    "Diagnostics": "diagnostics",
-    "LatentCallback": "callback",
-    "diagnose": "diagnostics",
-    "play": "latents",
-    "record": "film",
-}
 
 
 def __getattr__(name: str) -> Any:  # imported on use: the metrics need neither matplotlib nor imageio

@@ -3,30 +3,26 @@
 import argparse
 import os
 import pathlib
-import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 import gymnasium as gym
 from matplotlib.figure import Figure
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr import AGENTS
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
-from sb3_eqr.visualize.latents import Play, encode, play
+from sb3_eqr.visualize.latents import Play, encode, names_of_factors, play
 from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictures
 from sb3_eqr.visualize.tables import all_tables, write_tables
-from sb3_eqr.visualize.tables import factor_names as all_names
 
 DEPTH = 5  # for agents without latent losses
 FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # argument of play -> flag
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """:return: the parser of the command"""
+    """The parser of the command."""
     parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
     parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file written by an agent's save")
     parser.add_argument("--env", help="gymnasium id (default: from RL Zoo's files next to MODEL)")
@@ -46,10 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> None:
-    """
-    :param args: arguments of the command
-    :raises ValueError: for invalid arguments
-    """
+    """Run the command; raises a ValueError for invalid arguments."""
     if args.n_envs < 1:
         raise ValueError(f"--n-envs must be >= 1, got {args.n_envs}.")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # environments draw in memory: pygame needs no display
@@ -70,9 +63,11 @@ def run(args: argparse.Namespace) -> None:
     tables = all_tables(diagnostics, actions, factors)
     write_tables(tables, folder)
     figures = all_pictures(diagnostics, actions, factors)
-    write_pictures({**figures, **latent_figures(model, played, factors, periodic)}, folder)
+    write_pictures(figures | latent_figures(model, played, factors, periodic), folder)
     if args.video:
-        write_video(model, env, folder, depth, args)
+        from sb3_eqr.visualize.film import record  # only videos need its libraries
+
+        record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
     print(diagnostics.summary)
     table = tables["transition"][["steps_ahead", "loss", "loss_shuffled", "loss_still"]]
     print(table.to_string(index=False, float_format="{:.2g}".format))
@@ -80,41 +75,24 @@ def run(args: argparse.Namespace) -> None:
 
 
 def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str], periodic: Sequence[str] = ()) -> dict[str, Figure]:
-    """
-    :param factors: names of the true factors, if known
-    :param periodic: the keys of ``info`` whose factors are periodic, from the environment's metadata
-    :return: one figure coloured by time, or one per factor
-    """
+    """One figure coloured by time, or one per true factor; ``periodic`` has the keys of ``info`` whose factors are."""
     states = encode(model, played.samples.observations)
     if played.factors is None:
         return {"latents": latent_figure(model, states)}
-    names = all_names(played.factors.shape[1], factors)
+    names = names_of_factors(played.factors.shape[1], factors)
     return {
         f"latents_{name.replace(' ', '_')}": latent_figure(model, states, values, name, name.split(" ")[0] in periodic)
         for name, values in zip(names, played.factors.T, strict=True)
     }
 
 
-def write_video(model: EqRAlgorithm, env: VecEnv, folder: pathlib.Path, depth: int, args: argparse.Namespace) -> None:
-    """:param folder: folder for play.mp4 and play.gif"""
-    from sb3_eqr.visualize.film import record  # only videos need its libraries
-
-    record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
-
-
-def fail(message: str) -> NoReturn:
-    """Print an error without a traceback, and exit with status 2 as argparse does."""
-    print(f"sb3-eqr visualize: {message}", file=sys.stderr)
-    raise SystemExit(2)
-
-
 def main() -> None:
-    """Parse the command line and run the command."""
-    args = make_parser().parse_args()
+    """Parse the command line and run the command; an error exits with status 2 and without a traceback, as argparse does."""
+    parser = make_parser()
     try:
-        run(args)
+        run(parser.parse_args())
     except (ValueError, ImportError, OSError, gym.error.Error) as error:
-        fail(str(error).replace("trust=True", "--trust"))
+        parser.exit(2, f"{parser.prog}: {str(error).replace('trust=True', '--trust')}\n")
 
 
 if __name__ == "__main__":

@@ -8,13 +8,12 @@ from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutput
 
 from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.visualize.diagnostics import Diagnostics, diagnose, skill_and_gain
-from sb3_eqr.visualize.latent_figure import latent_figure
+from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import check_agent, encode, group_model, replayed
-from sb3_eqr.visualize.measures import mean_of_known
+from sb3_eqr.visualize.pictures import latent_figure
 
-NO_PICTURES = {CSVOutputFormat: "csv", HumanOutputFormat: "stdout", JSONOutputFormat: "json"}
-EXCLUDED = (*NO_PICTURES.values(), "log")  # "log": HumanOutputFormat writing to a file
+NO_PICTURES = (CSVOutputFormat, HumanOutputFormat, JSONOutputFormat)
+EXCLUDED = ("csv", "stdout", "log", "json")  # their names; "log": HumanOutputFormat writing to a file
 
 
 class LatentCallback(BaseCallback):
@@ -81,8 +80,9 @@ class LatentCallback(BaseCallback):
             return  # no window is complete yet
         play = replayed(self.model, self.n_windows, np.random.default_rng([self.model.seed or 0, self.num_timesteps]))
         found = diagnose(self.model, play)
-        for name, value in scalars(found).items():
-            if np.isfinite(value):
+        symmetry = np.nan if found.action_symmetry is None else found.action_symmetry.distance
+        for name, value in {**found.scalars, "symmetry_distance": symmetry}.items():
+            if np.isfinite(value) and name != "dimensions":
                 self.logger.record(f"latent/{name}", value)
         if self.pictures and any(type(kind) not in NO_PICTURES for kind in self.logger.output_formats):
             ages = (buffer.pos - 1 - play.samples.indices // buffer.n_envs) % buffer.buffer_size
@@ -91,23 +91,3 @@ class LatentCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"{self.num_timesteps} steps: {found.summary}")
         self.logger.dump(self.num_timesteps)
-
-
-def scalars(found: Diagnostics) -> dict[str, float]:
-    """
-    :param found: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
-    :return: the metrics to log as curves; NaN for undefined ones
-    """
-    skill, gain = skill_and_gain(found.loss)
-    blocks = found.disentanglement
-    return {
-        "skill": skill,
-        "gain": gain,
-        "effective_rank": found.collapse.effective_rank,
-        "spread": found.collapse.spread,
-        "dead_units": found.collapse.dead_units,
-        "specificity": mean_of_known(blocks.specificity),
-        "redundancy": mean_of_known(blocks.redundancy[~np.eye(len(blocks.redundancy), dtype=bool)]),
-        "symmetry_distance": np.nan if found.action_symmetry is None else found.action_symmetry.distance,
-        "reward_explained": mean_of_known(found.rewards.explained),
-    }

@@ -7,21 +7,9 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.visualize import measures
-from sb3_eqr.visualize.findings import (
-    ActionSymmetry,
-    Collapse,
-    Disentanglement,
-    Generators,
-    Motion,
-    find_action_symmetry,
-    find_collapse,
-    find_disentanglement,
-    find_generators,
-    find_motion,
-)
-from sb3_eqr.visualize.latents import Play, action_elements, check_agent, eval_mode, latents
-from sb3_eqr.visualize.measures import Rewards, Transition
+from sb3_eqr.visualize import findings, measures
+from sb3_eqr.visualize.latents import Play, action_elements, check_agent, each_block, eval_mode, latents
+from sb3_eqr.visualize.measures import Rewards, Transition, mean_of_known
 
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
@@ -45,11 +33,11 @@ class Diagnostics(NamedTuple):
     blocks: list[str]  # (K,): "SE(2) 0", ...
     transition: Transition  # in the latent space
     loss: Transition  # the same between p(x̂_m) and p(x_m) on the unit sphere: the distance of Eq. 18, which training uses
-    motion: Motion
-    generators: list[Generators]  # one per group
-    disentanglement: Disentanglement
-    action_symmetry: ActionSymmetry | None  # None if the group has no inverse
-    collapse: Collapse
+    motion: findings.Motion
+    generators: list[findings.Generators]  # one per group
+    disentanglement: findings.Disentanglement
+    action_symmetry: findings.ActionSymmetry | None  # None if the group has no inverse
+    collapse: findings.Collapse
     rewards: Rewards
     verdict: str  # "predicts", "does not predict", "collapsed" or "not trained"
     rewards_trained: bool = True  # whether the agent's settings train its reward predictor
@@ -67,6 +55,24 @@ class Diagnostics(NamedTuple):
         unless = UNLESS if latent_gain < PREDICTS else ""
         return SENTENCES[self.verdict].format(errors=errors, unless=unless, limit=PREDICTS)
 
+    @property
+    def scalars(self) -> dict[str, float]:
+        """The metrics that are one number each; NaN for undefined ones."""
+        skill, gain = skill_and_gain(self.loss)
+        blocks, collapse = self.disentanglement, self.collapse
+        return {
+            "skill": skill,
+            "gain": gain,
+            "effective_rank": collapse.effective_rank,
+            "dimensions": collapse.dimensions,
+            "spread": collapse.spread,
+            "dead_units": collapse.dead_units,
+            "specificity": mean_of_known(blocks.specificity),
+            "redundancy": mean_of_known(blocks.redundancy[~np.eye(len(blocks.redundancy), dtype=bool)]),
+            "gap": np.nan if blocks.gap is None else mean_of_known(blocks.gap),
+            "reward_explained": mean_of_known(self.rewards.explained),
+        }
+
 
 def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     """
@@ -79,26 +85,24 @@ def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
     """
     check_agent("diagnose", model)
     data = latents(model, play.samples)
-    project = model.policy.latent_model.project
+    compared = (data.states, data.next_states, data.predicted)
     with th.no_grad(), eval_mode(model):
-        start, following, predicted = (
-            F.normalize(project(x), dim=-1) for x in (data.states, data.next_states, data.predicted)
-        )
+        start, following, predicted = (F.normalize(model.policy.latent_model.project(x), dim=-1) for x in compared)
     chosen = th.linspace(0, len(data.states) - 1, min(len(data.states), MAX_STATES)).long().to(data.states.device)
     elements = action_elements(model, data.states[chosen])  # (n, A, D)
-    motion = find_motion(model, data, data.states[chosen], elements)
-    generators = find_generators(model, elements)
+    motion = findings.find_motion(model, data, data.states[chosen], elements)
+    generators = findings.find_generators(model, elements)
     loss = measures.transition_error(start, following, predicted, data.mask)
     signed = model.policy.options.reward_loss == "categorical"
     return Diagnostics(
-        blocks=[f"{part.group} {i}" for part in generators for i in range(part.mean.shape[1])],
-        transition=measures.transition_error(data.states, data.next_states, data.predicted, data.mask),
+        blocks=[name for name, *_ in each_block(model, data.states)],
+        transition=measures.transition_error(*compared, data.mask),
         loss=loss,
         motion=motion,
         generators=generators,
-        disentanglement=find_disentanglement(model, data.states, play.factors, motion, generators),
-        action_symmetry=find_action_symmetry(model, data, np.random.default_rng(seed)),
-        collapse=find_collapse(model, data.states, play.samples.observations),
+        disentanglement=findings.find_disentanglement(model, data.states, play.factors, motion, generators),
+        action_symmetry=findings.find_action_symmetry(model, data, np.random.default_rng(seed)),
+        collapse=findings.find_collapse(model, data.states, play.samples.observations),
         rewards=measures.reward_error(data.predicted_rewards, data.rewards.sign() if signed else data.rewards, data.mask),
         verdict=find_verdict(loss, is_trained=model.depth > 0),
         rewards_trained=model.depth > 0 and model.reward_coef > 0,
@@ -127,10 +131,7 @@ def find_verdict(loss: Transition, is_trained: bool = True) -> str:
 
 
 def skill_and_gain(errors: Transition) -> tuple[float, float]:
-    """
-    :return: skill and gain over all steps ahead, so that a step in which nothing moves has no weight; NaN if undefined at
-        every step
-    """
+    """Skill and gain over all steps, so that one in which nothing moves has no weight; NaN if undefined at every step."""
     error, shuffled, still = (_mean(x, errors.n_windows) for x in (errors.error, errors.shuffled, errors.still))
     known = [~np.isnan(x).all() for x in (errors.skill, errors.gain)]
     return (1 - error / shuffled if known[0] else np.nan), (1 - error / still if known[1] else np.nan)

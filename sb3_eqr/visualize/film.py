@@ -2,8 +2,6 @@
 
 import colorsys
 import pathlib
-import random
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple
@@ -18,6 +16,7 @@ from matplotlib.lines import Line2D
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from torch.utils.data import default_collate
 
 from sb3_eqr.common.checks.arguments import check, integer, number
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -26,18 +25,20 @@ from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.plot_style import GREY, INK, styled
-from sb3_eqr.visualize.latents import as_vec_env, check_agent, encode, eval_mode, frame, group_model, split
+from sb3_eqr.visualize import latents
 from sb3_eqr.visualize.loading import action_names
 
 WIDTH, HEIGHT, DPI = 900, 500, 100  # pixels; even, as H.264 requires
-FORMATS = ("mp4", "gif")
 EVERY = {"mp4": 1, "gif": 2}  # write every n-th frame
+FORMATS = tuple(EVERY)
 FPS = 15  # Atari's 60 frames per second, of which an agent observes every fourth
 MAX_PANELS, MAX_BARS, TRAIL = 36, 16, 12  # TRAIL: steps of the line behind a dot
 ARROW, ROOM, GHOST_ROOM = 0.4, 0.85, 3.0  # arrow at a dot, largest coordinate, in half panels; growth for predictions
 VIEW = np.array([[0.866, -0.211], [0.5, 0.366], [0.0, 0.906]])  # from 60° to the left and 25° above, as in matplotlib
-AXES, PREDICTED_AXES = ("#c82828", "#1e8c32", "#1e50c8"), ("#f2b2b2", "#acdcb4", "#b2c6f4")  # x, y, z
-LINE, (NOW, PREDICTED) = "#dadee3", ("#1446a0", "#f49840")
+AXES, PALE_AXES = ("#c82828", "#1e8c32", "#1e50c8"), ("#f2b2b2", "#acdcb4", "#b2c6f4")  # x, y, z
+LINE, NOW, PREDICTED = "#dadee3", "#1446a0", "#f49840"
+NOW_DOT: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 4.5}
+GHOST_DOT: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 7, "mfc": "none"}
 
 
 class Film(NamedTuple):
@@ -95,7 +96,7 @@ def record(
     :raises ValueError: for an argument out of range, or an environment with other spaces than the agent's
     :raises ImportError: without the extra "visualize"
     """
-    check_agent("record", model)
+    latents.check_agent("record", model)
     check("depth", depth, integer(1))
     check("n_steps", n_steps, integer(depth + 1))
     check("fps", fps, number(1, 50))
@@ -105,74 +106,61 @@ def record(
     path = path.with_suffix("") if path.suffix[1:].lower() in FORMATS else path  # x.mp4 would become x.mp4.mp4
     with preserved_rng_state(model.action_space):
         film = shoot(model, env, n_steps, seed, deterministic)
-    states = encode(model, film.observations)  # (T, D)
+    states = latents.encode(model, film.observations)  # (T, D)
     shown = panels(model, th.stack([states, predictions(model, states, film.actions, film.starts, depth)]).cpu())
     return write_video(Painter(shown, film.starts, depth, describe(model, len(shown))).frames(film), path, formats, fps)
 
 
 def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deterministic: bool) -> Film:
     """Run the agent; parameters as in :func:`record`. Seeds the global generators."""
-    env = as_vec_env(model, env)
+    env = latents.as_vec_env(model, env)
     for what in ("observation_space", "action_space"):
-        if getattr(env, what) != getattr(model, what):
-            raise ValueError(
-                f"env must have the agent's {what} {getattr(model, what)}, got {getattr(env, what)}. "
-                "Wrap the environment as in training."
-            )
-    normalize, renders = unwrap_vec_normalize(env), env.render_mode == "rgb_array"
-    for seed_generator in (random.seed, np.random.seed, th.manual_seed, model.action_space.seed, env.seed):
-        seed_generator(seed)  # the action space draws ε-greedy actions
-    obs: Any = env.reset()
-    observations, pictures, actions, rewards, starts, start = [], [], [], [], [], 0
+        wanted, got = getattr(model, what), getattr(env, what)
+        if got != wanted:
+            raise ValueError(f"env must have the agent's {what} {wanted}, got {got}. Wrap the environment as in training.")
+    normalize, obs = unwrap_vec_normalize(env), latents.reset(model, env, seed)
+    rows, pictures, actions, rewards, starts = [], [], [], [], [0]
     for t in range(n_steps):
-        observations.append({key: x[0] for key, x in obs.items()} if isinstance(obs, dict) else obs[0])
-        if renders:
+        rows.append(latents.each_part(obs, lambda x: x[0]))
+        if env.render_mode == "rgb_array":
             pictures.append(np.asarray(env.get_images()[0], dtype=np.uint8))
         chosen, _ = model.predict(obs, deterministic=deterministic)
         obs, reward, dones, _ = env.step(chosen)
         actions.append(int(chosen[0]))
         rewards.append(float((reward if normalize is None else normalize.get_original_reward())[0]))
-        starts.append(start)
-        start = t + 1 if dones[0] else start
-    is_dict, rows = isinstance(observations[0], dict), np.array(observations)  # of dicts an array of objects
-    seen: Any = {key: np.stack([row[key] for row in rows]) for key in rows[0]} if is_dict else rows
-    pictures = pictures or observed_pictures(seen, model.observation_space, model.frame_stack)
+        starts.append(t + 1 if dones[0] else starts[-1])
+    seen = default_collate(rows)
+    pictures = pictures or observed_pictures(latents.each_part(seen, np.asarray), model.observation_space, model.frame_stack)
     names = [f"action {name}" if name.isdigit() else name for name in action_names(env, int(model.policy.action_space.n))]
-    tensors = {key: th.as_tensor(x) for key, x in seen.items()} if is_dict else th.as_tensor(seen)
-    return Film(tensors, pictures, np.array(actions), np.array(rewards), np.array(starts), names)
+    return Film(seen, pictures, np.array(actions), np.array(rewards), np.array(starts[:-1]), names)
 
 
 def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
-    """:return: what was predicted M = ``depth`` steps before x₀, (T, D), was seen; NaN in the first M steps of an episode"""
-    n = len(states) - depth
-    since = th.as_tensor(np.lib.stride_tricks.sliding_window_view(actions, depth)[:n].copy(), device=states.device)  # (n, M)
-    with th.no_grad(), eval_mode(model):
-        predicted = model.policy.latent_model.rollout(states[:n], model.policy.embed_actions(since))[:, -1]
-    old_enough = th.as_tensor(np.arange(depth, len(states)) - starts[depth:] >= depth, device=states.device)
-    nothing = th.full_like(states, float("nan"))
-    return th.cat([nothing[:depth], th.where(old_enough[:, None], predicted, nothing[depth:])])
+    """What was predicted M = ``depth`` steps before x₀, (T, D), was seen; NaN in the first M steps of an episode."""
+    since = th.as_tensor(actions, device=states.device).unfold(0, depth, 1)[:-1]  # (T - M, M)
+    with th.no_grad(), latents.eval_mode(model):
+        predicted = model.policy.latent_model.rollout(states[:-depth], model.policy.embed_actions(since))[:, -1]
+    is_old = th.as_tensor(np.arange(len(states)) - starts >= depth, device=states.device)
+    return th.where(is_old[:, None], th.cat([states[:depth], predicted]), th.nan)
 
 
 def describe(model: EqRAlgorithm, n_shown: int) -> str:
-    """:return: a description of the agent in one line, of which ``n_shown`` blocks are shown"""
-    group, n_blocks = group_model(model).group, group_model(model).n_blocks
+    """A description of the agent in one line, of which ``n_shown`` blocks are shown."""
+    group, n_blocks = latents.group_model(model).group, latents.group_model(model).n_blocks
     blocks = "no group" if isinstance(group, NoGroup) else f"{group}" if n_blocks == 1 else f"{n_blocks} blocks of {group}"
     blocks = blocks if len(blocks) < 45 else f"{blocks[:45]}..."
     return f"{type(model).__name__}, {blocks}{f', the first {MAX_PANELS}' if n_shown == MAX_PANELS else ''}"[:60]
 
 
 def panels(model: EqRAlgorithm, states: th.Tensor) -> list[Panel]:
-    """:return: one panel per block of ``states``, true and predicted, (2, T, D)"""
-    parts = split(model, states)
-    found: list[Panel] = []
-    for group, elements in parts:
-        for k in range(min(elements.shape[2], MAX_PANELS - len(found))):
-            found.append(panel(f"{len(found)} {group}" if len(parts) > 1 else f"{len(found)}", group, elements[:, :, k]))
-    return found
+    """One panel per block of ``states``, true and predicted, (2, T, D)."""
+    has_one_group = len(latents.split(model, states)) == 1
+    blocks = latents.each_block(model, states)[:MAX_PANELS]
+    return [panel(f"{k}" if has_one_group else f"{k} {group}", group, block) for k, (_, group, block) in enumerate(blocks)]
 
 
 def panel(name: str, group: Group, elements: th.Tensor) -> Panel:
-    """:return: the panel of one block, true and predicted, (2, T, *element_shape), at a constant scale"""
+    """The panel of one block, true and predicted, (2, T, *element_shape), at a constant scale."""
     arrows, dots = in_plane(group, elements)
     kind = "dot" if arrows is None else ["arrow", "parallelogram", "axes"][arrows.shape[2] - 1]
     half_width = None
@@ -193,7 +181,7 @@ def in_plane(group: Group, elements: th.Tensor) -> tuple[np.ndarray | None, np.n
     one arrow, its first column; any other 2×2 matrix is both columns; three dimensions are projected; of more dimensions only
     the first two coordinates are shown; vectors without a group are projected onto their principal axes.
     """
-    matrix, vector = frame(group, elements)
+    matrix, vector = latents.frame(group, elements)
     arrows = dots = None
     if matrix is not None and not (isinstance(group, SE) and matrix.shape[-1] == 1):  # no rotation in one dimension
         n_arrows = 1 if isinstance(group, (SO, SE)) and matrix.shape[-1] == 2 else 3
@@ -215,20 +203,16 @@ def _seen(vectors: np.ndarray) -> np.ndarray:
 
 
 def _extent(values: np.ndarray) -> float:
-    """:return: the half width that the true states need, or 98 % of the predictions, unless these are too far out"""
+    """The half width that the true states need, or 98 % of the predictions, unless these are too far out."""
     needed, ghosts = max(float(np.abs(values[0]).max()), 1e-6), np.abs(values[1][np.isfinite(values[1])])
     wanted = float(np.quantile(ghosts, 0.98)) if len(ghosts) else 0.0
-    return max(needed, wanted) if wanted <= GHOST_ROOM * needed else needed
+    return wanted if needed < wanted <= GHOST_ROOM * needed else needed
 
 
 class Painter:
     """
-    Draws the frames of one film.
-
-    :param panels: one per block
-    :param starts: the frame at which each frame's episode began, (T,)
-    :param depth: M, for the legend
-    :param about: description of the agent, at the bottom
+    Draws the frames of one film: a panel per block, and an image of the environment. ``starts`` has the frame at which each
+    frame's episode began, (T,); the legend has M, ``depth``, and the line at the bottom is ``about``.
     """
 
     def __init__(self, panels: Sequence[Panel], starts: np.ndarray, depth: int, about: str):
@@ -245,7 +229,7 @@ class Painter:
             ends = {"left": 0.695 - x, "right": 0.695 + x, "bottom": 0.51 - y, "top": 0.51 + y}
             grid = self.figure.add_gridspec(rows, columns, wspace=0.05, hspace=0.05, **ends)
             self.axes = [self.figure.add_subplot(grid[k // columns, k % columns]) for k in range(n)]
-            self.artists = [self._artists(ax, one) for ax, one in zip(self.axes, panels, strict=True)]
+            self.artists = [self._start(ax, one) for ax, one in zip(self.axes, panels, strict=True)]
             self.title = self.figure.text(0.012, 0.95, "", fontsize=11, color=INK, animated=True, family="monospace")
             self.figure.text(0.012, 0.025, about, color=GREY, fontsize=8)
             self._legend(depth)
@@ -253,7 +237,7 @@ class Painter:
         self.canvas.draw()
         self.ground = self.canvas.copy_from_bbox(self.figure.bbox)
 
-    def _artists(self, ax: Axes, panel: Panel) -> list[dict[str, Any]]:
+    def _start(self, ax: Axes, panel: Panel) -> list[dict[str, Any]]:
         """Draw what stays of a panel; return what moves: its true and its predicted block."""
         ax.set(xlim=(-1, 1), ylim=(-1, 1), xticks=[], yticks=[], aspect="equal", facecolor="#f6f7f9")
         ax.spines[:].set(visible=True, color=LINE)
@@ -268,56 +252,50 @@ class Painter:
         if panel.half_width is not None:
             ax.text(0.94, -0.94, f"edge ±{panel.half_width:.2g}", color=GREY, fontsize=size, ha="right")
         found = []
-        for color, axes, width, big in ((NOW, AXES, 1.5, False), (PREDICTED, PREDICTED_AXES, 3, True)):
-            look: dict[str, Any] = {"mfc": "none"} if big else {}
-            moving: dict[str, Any] = {
-                "dot": ax.plot([], [], "o", color=color, markersize=7 if big else 4.5, animated=True, **look)[0],
-                "beyond": ax.plot([], [], color=color, linestyle="", markersize=7, animated=True)[0],
-                "sides": ax.plot([], [], color=color, linewidth=width, animated=True)[0],
-                "trail": ax.plot([], [], color=NOW, alpha=0.35, linewidth=1, animated=True)[0],
+        for color, axes, dot, line, width in ((NOW, AXES, NOW_DOT, 1.5, 0.018), (PREDICTED, PALE_AXES, GHOST_DOT, 3, 0.026)):
+            looks: dict[str, Any] = {
+                "dot": {"color": color, **dot},
+                "beyond": {"color": color, "linestyle": "", "markersize": 7},
+                "sides": {"color": color, "linewidth": line},
+                "trail": {"color": NOW, "alpha": 0.35, "linewidth": 1},
             }
+            moving: dict[str, Any] = {name: ax.plot([], [], animated=True, **look)[0] for name, look in looks.items()}
             if panel.arrows is not None:
-                zeros = np.zeros(panel.arrows.shape[2])
-                look = {"color": axes[: len(zeros)] if panel.kind == "axes" else color, "width": 0.026 if big else 0.018}
-                look |= {"angles": "xy", "scale_units": "xy", "scale": 1, "animated": True}
-                moving["arrows"] = ax.quiver(zeros, zeros, zeros, zeros, **look)
+                zeros, colors = np.zeros(panel.arrows.shape[2]), axes if panel.kind == "axes" else color
+                scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1}
+                moving["arrows"] = ax.quiver(*[zeros] * 4, color=colors, width=width, animated=True, **scale)
             found.append(moving)
         return found
 
     def _legend(self, depth: int) -> None:
-        dot: dict[str, Any] = {"marker": "o", "linestyle": ""}
         predicted = f"predicted {depth} step{'' if depth == 1 else 's'} before"
         kinds = {panel.kind for panel in self.panels}
         dots = [panel.dots for panel in self.panels if panel.dots is not None]
-        handles = []
+        looks: dict[str, dict[str, Any]] = {}
         if "axes" not in kinds or dots:  # blue and orange are drawn
-            handles = [
-                Line2D([], [], color=NOW, markersize=4.5, label="now", **dot),
-                Line2D([], [], color=PREDICTED, markersize=7, mfc="none", label=predicted, **dot),
-            ]
+            looks |= {"now": {"color": NOW, **NOW_DOT}, predicted: {"color": PREDICTED, **GHOST_DOT}}
         if "arrow" in kinds:
-            handles.append(Line2D([], [], color=NOW, marker=r"$\rightarrow$", linestyle="", markersize=9, label="rotation"))
+            looks["rotation"] = {"color": NOW, "marker": r"$\rightarrow$", "linestyle": "", "markersize": 9}
         if dots:
-            handles.append(Line2D([], [], color=NOW, alpha=0.35, label=f"last {TRAIL} steps"))
+            looks[f"last {TRAIL} steps"] = {"color": NOW, "alpha": 0.35}
         if "axes" in kinds:
-            handles += [Line2D([], [], color=color, label=name) for name, color in zip("xyz", AXES, strict=True)]
-            handles.append(Line2D([], [], color=PREDICTED_AXES[0], label=f"pale: {'predicted' if dots else predicted}"))
+            looks |= {name: {"color": color} for name, color in zip("xyz", AXES, strict=True)}
+            looks[f"pale: {'predicted' if dots else predicted}"] = {"color": PALE_AXES[0]}
         if any((np.abs(both[1]) > 1).any() for both in dots):
-            handles.append(Line2D([], [], color=PREDICTED, marker="^", linestyle="", label="beyond the edge"))
+            looks["beyond the edge"] = {"color": PREDICTED, "marker": "^", "linestyle": ""}
+        handles = [Line2D([], [], label=label, **look) for label, look in looks.items()]
         self.figure.legend(handles=handles, loc="lower right", ncols=len(handles), fontsize=8, handlelength=1.5)
 
     def frames(self, film: Film) -> Iterator[np.ndarray]:
-        """:return: T of (HEIGHT, WIDTH, 3), uint8"""
+        """The T frames, (HEIGHT, WIDTH, 3), uint8."""
         score = 0.0
         for t, (action, reward, start) in enumerate(zip(film.actions, film.rewards, film.starts, strict=True)):
             score = reward + (0.0 if t == start else score)
-            name = film.action_names[action][:14]
-            yield self.paint(
-                t, film.pictures[t], f"step {t - start:<5d} {name:<14s} reward {reward:<+8.3g} score {score:<8.4g}"
-            )
+            did = f"step {t - start:<5d} {film.action_names[action][:14]:<14s}"
+            yield self.paint(t, film.pictures[t], f"{did} reward {reward:<+8.3g} score {score:<8.4g}")
 
     def paint(self, t: int, picture: np.ndarray, title: str) -> np.ndarray:
-        """:return: the frame of step t, (HEIGHT, WIDTH, 3), uint8, with the environment's image, (height, width, 3), uint8"""
+        """The frame of step t, (HEIGHT, WIDTH, 3), uint8, with the environment's image, (height, width, 3), uint8."""
         self.canvas.restore_region(self.ground)
         if self.picture is None:  # small images are enlarged without smoothing
             smooth = "antialiased" if min(picture.shape[:2]) > 100 else "nearest"
@@ -339,11 +317,11 @@ class Painter:
 
 
 def moved(panel: Panel, which: int, t: int, artists: dict[str, Any]) -> list[Any]:
-    """:return: the artists to draw at step t: none without a prediction, a triangle at the edge for a block beyond it"""
+    """The artists to draw at step t: none without a prediction, a triangle at the edge for a block beyond it."""
     arrows, at = (None if part is None else part[which, t] for part in (panel.arrows, panel.dots))
-    if not all(part is None or np.isfinite(part).all() for part in (arrows, at)):
-        return []
     foot = np.zeros(2) if at is None else at
+    if not np.isfinite(foot if arrows is None else foot + arrows).all():
+        return []
     if np.abs(foot).max() > 1:
         artists["beyond"].set_data(*(0.95 * foot / np.abs(foot).max())[:, None])
         artists["beyond"].set_marker((3, 0, round(np.degrees(np.arctan2(foot[1], foot[0]))) - 90))  # its tip outwards
@@ -373,22 +351,18 @@ def write_video(images: Iterator[np.ndarray], path: pathlib.Path, formats: Seque
         ) from error
     options: dict[str, dict[str, Any]] = {"mp4": {"quality": 8, "macro_block_size": 2, "fps": fps}}
     options["gif"] = {"loop": 0, "duration": 1000 * EVERY["gif"] / fps}
-    paths = [path.with_name(f"{path.name}.{suffix}") for suffix in formats]
-    with tempfile.TemporaryDirectory() as folder:
-        aside = {suffix: pathlib.Path(folder) / f"film.{suffix}" for suffix in formats}
-        with ExitStack() as stack:
-            writers: dict[str, Any] = {
-                suffix: stack.enter_context(imageio.get_writer(file, mode="I", **options[suffix]))
-                for suffix, file in aside.items()
-            }
-            for t, image in enumerate(images):
-                for suffix, writer in writers.items():
-                    if t % EVERY[suffix] == 0:
-                        writer.append_data(image)
-        for suffix, one in zip(formats, paths, strict=True):
-            with atomic_write(one, suffix) as file:
-                file.write(aside[suffix].read_bytes())
-    return paths
+    paths = {suffix: path.with_name(f"{path.name}.{suffix}") for suffix in formats}
+    with ExitStack() as stack:  # closes all writers before it renames the files
+        files = {suffix: stack.enter_context(atomic_write(file, suffix)) for suffix, file in paths.items()}
+        writers: dict[str, Any] = {
+            suffix: stack.enter_context(imageio.get_writer(file, format=suffix, mode="I", **options[suffix]))
+            for suffix, file in files.items()
+        }
+        for t, image in enumerate(images):
+            for suffix, writer in writers.items():
+                if t % EVERY[suffix] == 0:
+                    writer.append_data(image)
+    return [paths[suffix] for suffix in formats]
 
 
 def observed_pictures(observations: Any, space: spaces.Space, frame_stack: int) -> list[np.ndarray]:

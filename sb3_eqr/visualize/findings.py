@@ -7,11 +7,11 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.groups import SE, SO
 from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor, NormalizedExtractor
 from sb3_eqr.common.type_aliases import PyTorchObs
-from sb3_eqr.visualize import measures
-from sb3_eqr.visualize.latents import Latents, coordinate_names, coordinates, encode, eval_mode, frame, group_model, split
+from sb3_eqr.visualize import latents, measures
 
 DORMANT = 0.025  # Sokar et al. 2023, https://arxiv.org/abs/2302.12902
 
@@ -64,15 +64,12 @@ class Collapse(NamedTuple):
     dormant_units: float  # fraction with mean |h| ≤ 0.025 of the layer's mean
 
 
-def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
+def find_motion(model: EqRAlgorithm, data: latents.Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
     """
-    Distances in the block rather than sizes of κ: they are defined for every group, including "none", and have the units of
-    the transition error.
-
-    :param states: (n, D)
-    :param elements: κ of every action in these states, (n, A, D)
+    Motion by the elements κ of every action, (n, A, D), in states, (n, D). Distances in the block rather than sizes of κ: they
+    are defined for every group, including "none", and have the units of the transition error.
     """
-    latent_model = group_model(model)
+    latent_model = latents.group_model(model)
     n_actions = latent_model.action_dim
     before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
     moved = latent_model.act(latent_model.blocks(elements.flatten(0, 1)), before)
@@ -84,16 +81,14 @@ def find_motion(model: EqRAlgorithm, data: Latents, states: th.Tensor, elements:
 
 
 def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators]:
-    """:param elements: κ of every action in n states, (n, A, D)"""
+    """Statistics of κ, of every action in n states, (n, A, D)."""
     found = []
-    for group, blocks in split(model, elements):
-        values = coordinates(group, blocks)  # (n, A, K, C)
+    for group, blocks in latents.split(model, elements):
+        values = latents.coordinates(group, blocks)  # (n, A, K, C)
         mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
-        names = coordinate_names(group)
-        matrix, _ = frame(group, blocks)
-        if names[0].startswith("angle") and matrix is not None and matrix.shape[-1] == 2:
+        if isinstance(group, (SO, SE)) and group.n == 2:
             mean[..., 0], std[..., 0] = measures.angle_moments(values[..., 0])
-        found.append(Generators(str(group), names, _numpy(mean), _numpy(std)))
+        found.append(Generators(str(group), latents.coordinate_names(group), _numpy(mean), _numpy(std)))
     return found
 
 
@@ -101,19 +96,17 @@ def find_disentanglement(
     model: EqRAlgorithm, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
 ) -> Disentanglement:
     """
-    A block's information about a factor is that of its rotation or of its translation, whichever is larger; either is a lower
-    bound on the block's.
-
-    :param states: (N, D)
-    :param factors: (N, F), if known
+    Of states, (N, D), and true factors, (N, F), if known. A block's information about a factor is that of its rotation or of
+    its translation, whichever is larger; either is a lower bound on the block's.
     """
-    vectors = np.concatenate([part.mean.reshape(len(part.mean), -1) for part in generators], axis=1)  # (A, ...)
-    opposites = measures.opposites(vectors)
-    blocks = [(group, found[:, i]) for group, found in split(model, states) for i in range(found.shape[1])]
-    redundancy = measures.canonical_correlations([block.flatten(1) for _, block in blocks])
+    means = [part.mean.reshape(len(part.mean), -1) for part in generators]
+    opposites = measures.opposites(np.concatenate(means, axis=1))
+    blocks = latents.each_block(model, states)
+    redundancy = measures.canonical_correlations([block.flatten(1) for *_, block in blocks])
     information = gap = None
     if factors is not None:
-        labels = [[measures.cells(part.flatten(1)) for part in frame(*block) if part is not None] for block in blocks]
+        frames = [latents.frame(group, block) for _, group, block in blocks]
+        labels = [[measures.cells(part.flatten(1)) for part in parts if part is not None] for parts in frames]
         binned = [measures.bins(factor) for factor in factors.T]
         information = np.array([[_information(parts, factor) for factor in binned] for parts in labels])
         gap = measures.information_gap(information)
@@ -126,24 +119,19 @@ def _information(parts: list[np.ndarray], factor: np.ndarray) -> float:
     return max(measures.mutual_information(part, factor) for part in parts) / whole if whole > 0 else np.nan
 
 
-def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Generator) -> ActionSymmetry | None:
-    """
-    The effect of ρ in Eq. 19, computed with the online networks only.
-
-    :param rng: generator that draws each state's partner
-    """
-    latent_model = group_model(model)
-    group, n = latent_model.group, len(data.states)
+def find_action_symmetry(model: EqRAlgorithm, data: latents.Latents, rng: np.random.Generator) -> ActionSymmetry | None:
+    """The effect of ρ in Eq. 19, computed with the online networks only; ``rng`` draws each state's partner."""
+    latent_model, n = latents.group_model(model), len(data.states)
+    group = latent_model.group
     if not group.has_inverse or n < 2:
         return None
     order = rng.permutation(n)
     partner = np.empty(n, dtype=int)
     partner[order] = np.roll(order, 1)  # never the state itself
-    state, other = (x.unflatten(1, (-1, *group.element_shape)) for x in (data.states, data.states[partner]))
-    with th.no_grad(), eval_mode(model):
+    state, other = (latent_model.blocks(x) for x in (data.states, data.states[partner]))
+    with th.no_grad(), latents.eval_mode(model):
         symmetry = group.compose(other, group.inverse(state))  # τ_g, (N, K, ...)
-        params = latent_model.action_symmetry(symmetry.flatten(1))
-        rho = group.element(params.unflatten(1, (-1, group.num_params)))
+        rho = latent_model.element(latent_model.action_symmetry(symmetry.flatten(1)))
         kappa = latent_model.action_element(data.states, model.policy.embed_actions(data.actions[:, 0]))
         left = latent_model.symmetry_projection(latent_model.act(symmetry, data.predicted[:, 0]))
         right, plain = (
@@ -156,42 +144,36 @@ def find_action_symmetry(model: EqRAlgorithm, data: Latents, rng: np.random.Gene
 
 
 def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchObs) -> Collapse:
-    """
-    :param states: (N, D)
-    :param observations: the observations of these states, N
-    """
+    """The collapse of states, (N, D), and of the units that encode their observations, N."""
     size = float(states.double().square().sum(dim=1).mean().sqrt())
     spectrum = measures.spectrum(states)
     spread = float(np.linalg.norm(spectrum)) / size if size > 0 else 0.0
-    low, high, mean = _activity(model, observations)  # (U,) each
+    rank = measures.effective_rank(spectrum, size)
+    outputs = _trunk_outputs(model, observations)
+    low, high, mean = outputs.amin(dim=0), outputs.amax(dim=0), outputs.abs().mean(dim=0)  # (U,) each
     dead = high - low <= measures.ROUNDING * th.maximum(high.abs(), low.abs())
     dormant = mean <= DORMANT * mean.mean()
-    rank = measures.effective_rank(spectrum, size)
     fractions = [float(x.double().mean()) for x in (dead, dormant)]
     return Collapse(size, spread, rank, states.shape[1], spectrum, len(dead), *fractions)
 
 
-def _activity(model: EqRAlgorithm, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """:return: minimum, maximum and mean absolute output of each unit of the trunk, (U,) each"""
+def _trunk_outputs(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
+    """The outputs of the trunk, (N, U)."""
     trunk: Any = model.policy.online.features_extractor
     while isinstance(trunk, (GroupFeaturesExtractor, NormalizedExtractor)):
         trunk = trunk.trunk  # after a layer norm, a unit that is always 0 is not constant
     seen: list[th.Tensor] = []
     hook = trunk.register_forward_hook(lambda _module, _inputs, output: seen.append(output.flatten(1)))
     try:
-        encode(model, observations)
+        latents.encode(model, observations)
     finally:
         hook.remove()
-    outputs = th.cat(seen)  # (N, U)
-    return outputs.amin(dim=0), outputs.amax(dim=0), outputs.abs().mean(dim=0)
+    return th.cat(seen)
 
 
 def _block_norms(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
-    """
-    :param states: flat, (N, D)
-    :return: (N, K)
-    """
-    return th.cat([found.flatten(2).norm(dim=2) for _, found in split(model, states)], dim=1)
+    """The size of each block of flat states, (N, D) to (N, K)."""
+    return th.cat([found.flatten(2).norm(dim=2) for _, found in latents.split(model, states)], dim=1)
 
 
 def _numpy(tensor: th.Tensor) -> np.ndarray:

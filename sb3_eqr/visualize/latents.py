@@ -1,9 +1,8 @@
 """The latent states of an agent on windows of steps: the input of all metrics, figures and animations."""
 
-from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from math import prod
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,13 +11,14 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.latent.latent_model import LatentModel
+from sb3_eqr.common.objective import flat
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -55,21 +55,23 @@ class Blocks(NamedTuple):
 
 
 def check_agent(name: str, model: Any) -> None:
-    """
-    :param name: name of the caller, for the message
-    :raises ValueError: if the model is not an EqR agent
-    """
+    """Raise a ValueError, with the name of the caller, if the model is not an EqR agent."""
     if not isinstance(model, EqRAlgorithm):
         found = type(model).__name__
         raise ValueError(f"{name} needs an EqR agent (EqRQRDQN, EqRRainbow), got {found}, which has no latent model.")
 
 
 def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
-    """
-    :param env: the environment, or its gymnasium id
-    :return: the environment, with images channels first as in training
-    """
+    """The environment, or that with this gymnasium id, with images channels first as in training."""
     return model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
+
+
+def reset(model: EqRAlgorithm, env: VecEnv, seed: int) -> Any:
+    """Seed the environment and all generators, including that of the agent's ε-greedy actions; returns the observations."""
+    set_random_seed(seed)
+    model.action_space.seed(seed)
+    env.seed(seed)
+    return env.reset()
 
 
 def play(
@@ -91,44 +93,57 @@ def play(
     env = as_vec_env(model, env)
     check("depth", depth, integer(1))
     check("n_steps", n_steps, integer((2 * depth + 2) * env.num_envs))
-    space = normalized_space(env)
-    buffer = SequenceReplayBuffer(n_steps, space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth)
     factors: list[np.ndarray | None] = []
-    with preserved_rng_state(model.action_space, env.action_space):  # the first draws random actions
-        set_random_seed(seed)
-        model.action_space.seed(seed)
-        env.seed(seed)
-        obs: Any = env.reset()
+    with preserved_rng_state(model.action_space, env.action_space):
+        obs = reset(model, env, seed)
+        space = _space(obs, env.observation_space)
+        buffer = SequenceReplayBuffer(n_steps, space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth)
         infos: list[dict[str, Any]] = env.unwrapped.reset_infos
         for _ in range(buffer.buffer_size):
             factors.append(_factors(infos))
-            actions, _ = model.predict(obs, deterministic=deterministic)  # type: ignore[arg-type]
+            actions, _ = model.predict(obs, deterministic=deterministic)
             new_obs, rewards, dones, infos = env.step(actions)
             buffer.add(obs, _true_next(new_obs, dones, infos), actions, rewards, dones, infos)
             infos = [
                 env.unwrapped.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))
             ]
             obs = new_obs
-    starts, envs = (grid.ravel() for grid in np.meshgrid(np.arange(buffer.n_starts), np.arange(env.num_envs), indexing="ij"))
+    starts, envs = np.indices((buffer.n_starts, env.num_envs)).reshape(2, -1)
     samples = buffer.windows(starts, envs)  # already normalised by a VecNormalize
     known = all(found is not None for found in factors)
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
 
 
-def normalized_space(env: VecEnv) -> spaces.Space:
-    """The space of what the environment returns: VecNormalize makes floats of integers, but keeps the space of vectors."""
-    normalize, space = unwrap_vec_normalize(env), env.observation_space
-    if normalize is None or not normalize.norm_obs:
-        return space
+def _space(obs: Any, space: spaces.Space) -> spaces.Space:
+    """The space of the observations: VecNormalize makes floats of integers, but keeps the space of vectors."""
     if isinstance(space, spaces.Dict):
-        keys = normalize.norm_obs_keys or []
-        return spaces.Dict(OrderedDict((key, _as_floats(part) if key in keys else part) for key, part in space.spaces.items()))
-    return _as_floats(space)
+        return spaces.Dict({key: _space(obs[key], part) for key, part in space.spaces.items()})
+    is_changed = np.issubdtype(space.dtype, np.integer) and np.issubdtype(obs.dtype, np.floating)
+    return spaces.Box(-np.inf, np.inf, space.shape, np.float32) if is_changed else space
 
 
-def _as_floats(space: spaces.Space) -> spaces.Space:
-    is_integer = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer)
-    return spaces.Box(-np.inf, np.inf, space.shape, np.float32) if is_integer else space
+def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
+    """The true states, (n_envs, F); ``None`` if an environment does not report it."""
+    found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
+    return np.array([np.concatenate(row) for row in found]) if all(found) else None
+
+
+def names_of_factors(n_factors: int, names: Sequence[str]) -> list[str]:
+    """The names if their number is right, or else numbers."""
+    return list(names) if len(names) == n_factors else [f"factor {i}" for i in range(n_factors)]
+
+
+def _true_next(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+    """The next observations, with the terminal one where an episode has ended."""
+    found = deepcopy(new_obs)
+    for i in np.flatnonzero(dones):
+        terminal = infos[i]["terminal_observation"]
+        if isinstance(found, dict):
+            for key, obs in found.items():
+                obs[i] = terminal[key]
+        else:
+            found[i] = terminal
+    return found
 
 
 def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> Play:
@@ -152,11 +167,7 @@ def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> P
 
 
 def group_model(model: EqRAlgorithm) -> LatentModel:
-    """
-    The agent's latent model.
-
-    :raises ValueError: if it does not use groups
-    """
+    """The agent's latent model; raises a ValueError if it does not use groups."""
     found = model.policy.latent_model
     if isinstance(found, ConvLatentModel):
         raise ValueError(
@@ -177,12 +188,19 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """
     check_agent("encode", model)
     n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
-    pieces = []
+    states = []
     with th.no_grad(), eval_mode(model):
         for start in range(0, n, CHUNK):
-            piece = _map(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
-            pieces.append(model.policy.latent_model.embedding(model.policy.online.features(piece)))
-    return th.cat(pieces)
+            chunk = each_part(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
+            states.append(model.policy.latent_model.embedding(model.policy.online.features(chunk)))
+    return th.cat(states)
+
+
+def each_part(observations: Any, function: Any) -> Any:
+    """Apply a function to observations, or to each entry of a dict of these."""
+    if isinstance(observations, dict):
+        return {key: function(obs) for key, obs in observations.items()}
+    return function(observations)
 
 
 def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latents:
@@ -196,22 +214,15 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     mask = samples.mask.to(model.device)
     actions = (samples.rollout_actions.to(model.device) * mask.long()).long()
     states = encode(model, samples.observations)
-    following = encode(model, _map(samples.rollout_observations, lambda obs: obs.flatten(0, 1)))
-    latent_model = model.policy.latent_model
+    following = encode(model, flat(samples.rollout_observations))  # (N * M, D)
+    rewards, latent_model = samples.rollout_rewards.to(model.device), model.policy.latent_model
     with th.no_grad(), eval_mode(model):
         predicted = latent_model.rollout(states, model.policy.embed_actions(actions))
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
-    return Latents(
-        states,
-        following.unflatten(0, mask.shape),
-        predicted,
-        outputs.view(mask.shape),
-        actions,
-        samples.rollout_rewards.to(model.device),
-        mask,
-    )
+    following = following.unflatten(0, mask.shape)
+    return Latents(states, following, predicted, outputs.view(mask.shape), actions, rewards, mask)
 
 
 def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
@@ -239,13 +250,18 @@ def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
     elements = states.unflatten(-1, (latent_model.n_blocks, *group.element_shape))
     if not isinstance(group, ProductGroup):
         return [Blocks(group, elements)]
-    sizes = [count * prod(factor.element_shape) for factor, count in group.factors]
-    pieces = elements.split(sizes, dim=-1)  # (..., K, count * prod(element_shape))
-    found = []
-    for (factor, count), piece in zip(group.factors, pieces, strict=True):
-        blocks = piece.unflatten(-1, (count, *factor.element_shape))  # (..., K, count, *element_shape)
-        found.append(Blocks(factor, blocks.flatten(-2 - len(factor.element_shape), -1 - len(factor.element_shape))))
-    return found
+    factors = [factor for factor, _ in group.factors]
+    pieces = zip(factors, group._unflatten(elements), strict=True)  # (..., K, count, *element_shape) each
+    return [Blocks(factor, piece.flatten(states.dim() - 1, states.dim())) for factor, piece in pieces]
+
+
+def each_block(model: EqRAlgorithm, states: th.Tensor) -> list[tuple[str, Group, th.Tensor]]:
+    """Name, such as "SE(2) 0", group and elements, (..., *element_shape), of each block of states, (..., D)."""
+    return [
+        (f"{group} {i}", group, block)
+        for group, elements in split(model, states)
+        for i, block in enumerate(elements.unbind(-1 - len(group.element_shape)))
+    ]
 
 
 def frame(group: Group, elements: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None]:
@@ -271,36 +287,30 @@ def coordinates(group: Group, elements: th.Tensor) -> th.Tensor:
     :param elements: (..., *element_shape)
     :return: (..., C), C = len(coordinate_names(group))
     """
+    if isinstance(group, NoGroup):  # has no identity
+        return elements
     matrix, vector = frame(group, elements)
+    identity: Any = frame(group, group.identity(dtype=elements.dtype, device=elements.device))
     parts = []
-    if matrix is not None and isinstance(group, (SO, SE)):
-        parts.append(_rotation_log(matrix))
-    elif matrix is not None:
-        parts.append((matrix - th.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)).flatten(-2))
-    if vector is not None and _is_own(group):
-        parts.append(vector - group.identity(dtype=vector.dtype, device=vector.device).flatten())
-    elif vector is not None:
-        parts.append(vector)
+    if matrix is not None:
+        parts.append(_rotation_log(matrix) if isinstance(group, (SO, SE)) else (matrix - identity[0]).flatten(-2))
+    if vector is not None:
+        parts.append(vector - identity[1])
     return th.cat(parts, dim=-1)
 
 
 def coordinate_names(group: Group) -> list[str]:
     """:return: "angle 0-1", ..., or "a 0-0", ...; then "t 0", ...; or "x 0", ... if elements are not matrices"""
     matrix, vector = frame(group, th.zeros(group.element_shape))
-    names = []
-    if matrix is not None:
-        n = matrix.shape[-1]
-        rotation = isinstance(group, (SO, SE))
-        pairs = [(i, j) for i in range(n) for j in range(n) if i < j or not rotation]
-        names = [f"{'angle' if rotation else 'a'} {i}-{j}" for i, j in pairs]
-    return names + ([] if vector is None else [f"{'x' if _is_own(group) else 't'} {i}" for i in range(vector.shape[-1])])
+    n, n_shifts = (0 if part is None else part.shape[-1] for part in (matrix, vector))
+    is_rotation = isinstance(group, (SO, SE))
+    entries = [(i, j) for i in range(n) for j in range(n) if i < j or not is_rotation]
+    kind = "t" if isinstance(group, (MatrixGroup, T, NoGroup)) else "x"
+    return [f"{'angle' if is_rotation else 'a'} {i}-{j}" for i, j in entries] + [f"{kind} {i}" for i in range(n_shifts)]
 
 
 def _rotation_log(rotation: th.Tensor) -> th.Tensor:
-    """
-    :param rotation: (..., n, n)
-    :return: the upper triangle of its logarithm, (..., n(n-1)/2)
-    """
+    """The upper triangle, (..., n(n-1)/2), of the logarithm of rotations, (..., n, n)."""
     n, dtype = rotation.shape[-1], rotation.dtype
     if n == 2:
         return th.atan2(rotation[..., 0, 1] - rotation[..., 1, 0], rotation[..., 0, 0] + rotation[..., 1, 1])[..., None]
@@ -311,39 +321,6 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
     log = (vectors * (1j * values.angle())[..., None, :] @ th.linalg.inv(vectors)).real
     i, j = th.triu_indices(n, n, 1)
     return log[..., i, j].to(dtype)
-
-
-def _is_own(group: Group) -> bool:
-    """:return: whether this is a user-defined group whose elements are not matrices"""
-    return not isinstance(group, (MatrixGroup, T, NoGroup))
-
-
-def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
-    """:return: (n_envs, F); ``None`` if an environment does not report its true state"""
-    found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
-    return np.array([np.concatenate(row) for row in found]) if all(found) else None
-
-
-def _true_next(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
-    """:return: the next observations, with the terminal one where an episode has ended"""
-    if isinstance(new_obs, dict):
-        return {
-            key: _true_next(
-                obs, dones, [{**i, "terminal_observation": i.get("terminal_observation", {}).get(key)} for i in infos]
-            )
-            for key, obs in new_obs.items()
-        }
-    result = new_obs.copy()
-    for i, done in enumerate(dones):
-        if done:
-            result[i] = infos[i]["terminal_observation"]
-    return result
-
-
-def _map(observations: PyTorchObs, function) -> Any:
-    if isinstance(observations, dict):
-        return {key: function(obs) for key, obs in observations.items()}
-    return function(observations)
 
 
 @contextmanager

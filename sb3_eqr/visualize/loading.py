@@ -1,19 +1,20 @@
 """Load a saved agent and the environment that it was trained in."""
 
 import ast
-import difflib
 import importlib
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
+import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_eqr.envs
 from sb3_eqr import AGENTS
+from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.saving.models import data_of, read_model
 from sb3_eqr.trust import check_statistics, check_zoo_folder
@@ -39,10 +40,8 @@ def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto"
 
 def find_algorithm(path: pathlib.Path) -> str:
     """
-    Detect the algorithm from the module of the policy's class, which is plain text: nothing is unpickled.
+    Detect which of ``AGENTS`` saved a file from the module of the policy's class, which is plain text: nothing is unpickled.
 
-    :param path: a saved agent
-    :return: one of ``AGENTS``
     :raises ValueError: if the policy is not one of this package's
     """
     saved = data_of(read_model(path)).get("policy_class", {})
@@ -84,12 +83,11 @@ def make_env(
     :raises ImportError: if RL Zoo or the environment is not installed
     """
     sb3_eqr.envs.register()
-    kwargs = dict(env_kwargs or {})
-    zoo = find_zoo_folder(path)
-    if zoo is not None and not trust:
-        check_zoo_folder(zoo, packages)
-    if zoo is not None and env_id in (None, zoo_arguments(zoo)["env"]):
-        env = _zoo_env(zoo, kwargs, n_envs, seed, render)
+    kwargs = env_kwargs or {}
+    folders = [file.parent for file in sorted(path.parent.glob("*/args.yml")) if (file.parent / "config.yml").is_file()]
+    arguments = _zoo_arguments(folders[0], trust, packages) if folders else {}
+    if folders and env_id in (None, arguments["env"]):
+        env = _zoo_env(folders[0], arguments, kwargs, n_envs, seed, render)
     elif env_id is None:
         raise ValueError(f"--env must be the agent's environment, got none, and RL Zoo's args.yml is not next to {path}.")
     elif env_id.startswith("ALE/") or "NoFrameskip" in env_id:
@@ -103,65 +101,52 @@ def make_env(
         if not trust:
             check_statistics(statistics)
         env = VecNormalize.load(str(statistics), env)
-    normalize = unwrap_vec_normalize(env)
-    if normalize is not None:
+    if (normalize := unwrap_vec_normalize(env)) is not None:
         normalize.training = False
     env = model._wrap_env(env, monitor_wrapper=False)
     try:
         check_for_correct_spaces(env, model.observation_space, model.action_space)
     except ValueError as error:
-        advice = "Pass the --env and --env-kwargs of training."
-        raise ValueError(f"--env does not have the agent's spaces. {error}. {advice}") from error
+        raise ValueError(
+            f"--env does not have the agent's spaces. {error}. Pass the --env and --env-kwargs of training."
+        ) from error
     return env
 
 
-def find_zoo_folder(path: pathlib.Path) -> pathlib.Path | None:
-    """
-    :param path: path of a model, such as logs/eqr_qrdqn/CartPole-v1_1/best_model.zip
-    :return: the folder next to it that contains args.yml and config.yml, such as CartPole-v1
-    """
-    found = sorted(file.parent for file in path.parent.glob("*/args.yml") if (file.parent / "config.yml").is_file())
-    return found[0] if found else None
-
-
-def zoo_arguments(folder: pathlib.Path) -> dict[str, Any]:
-    """
-    :param folder: see :func:`find_zoo_folder`
-    :return: the arguments of ``train``
-    """
-    import yaml
-
-    # Loaded as RL Zoo does: make_env has checked the file, or it is trusted.
+def _zoo_arguments(folder: pathlib.Path, trust: bool, packages: Sequence[str]) -> dict[str, Any]:
+    """The arguments of ``train``, loaded as RL Zoo does, once the folder has been checked or is trusted."""
+    if not trust:
+        check_zoo_folder(folder, packages)
     return yaml.load((folder / "args.yml").read_text(encoding="utf-8"), Loader=yaml.UnsafeLoader)
 
 
-def _zoo_env(folder: pathlib.Path, kwargs: dict[str, Any], n_envs: int, seed: int, render: bool) -> VecEnv:
+def _zoo_env(
+    folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, Any], n_envs: int, seed: int, render: bool
+) -> VecEnv:
+    """The environment of the run whose arguments of ``train`` and config.yml are in a folder."""
     try:
         import rl_zoo3.import_envs  # noqa: F401 - registers Atari and others
         from rl_zoo3.utils import create_test_env, get_saved_hyperparams
     except ImportError as error:
         advice = 'Run pip install ".[zoo]" in a clone of the repository.'
         raise ImportError(f"{folder} needs RL Zoo, which is not installed ({error}). {advice}") from error
-    arguments = zoo_arguments(folder)
     for package in arguments.get("gym_packages") or []:
         importlib.import_module(package)
     hyperparams, stats_path = get_saved_hyperparams(str(folder))
     norm_reward = (hyperparams.get("normalize_kwargs") or {}).get("norm_reward", True)
-    of_run = {**(hyperparams.pop("env_kwargs", None) or {}), **(arguments.get("env_kwargs") or {})}
-    made_with = {**of_run, **({"render_mode": "rgb_array"} if render else {}), **kwargs}
+    made_with = {**(hyperparams.pop("env_kwargs", None) or {}), **(arguments.get("env_kwargs") or {})}
+    made_with |= {**({"render_mode": "rgb_array"} if render else {}), **kwargs}
     options: dict[str, Any] = {"should_render": False, "env_kwargs": made_with, "vec_env_cls": DummyVecEnv}
     env = create_test_env(arguments["env"], n_envs, stats_path, seed, hyperparams=hyperparams, **options)
-    normalize = unwrap_vec_normalize(env)
-    if normalize is not None:
+    if (normalize := unwrap_vec_normalize(env)) is not None:
         normalize.norm_reward = norm_reward  # the reward predictor was trained on these rewards
     return env
 
 
 def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
     if env_id not in gym.registry:
-        near = difflib.get_close_matches(env_id, list(gym.registry), n=1, cutoff=0.8)
         raise ValueError(
-            f"--env: {env_id!r} is not registered with gymnasium.{f' Did you mean {near[0]!r}?' if near else ''} "
+            f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, cutoff=0.8)} "
             "Environments of another package need --gym-packages PACKAGE."
         )
     try:
@@ -171,10 +156,7 @@ def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> V
 
 
 def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
-    """
-    :param pairs: "key:value", where the value is a Python literal or a string
-    :raises ValueError: for another format
-    """
+    """Arguments from pairs "key:value", where the value is a Python literal or a string; others raise a ValueError."""
     found = {}
     for pair in pairs:
         key, colon, value = pair.partition(":")
@@ -188,17 +170,14 @@ def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
 
 
 def action_names(env: VecEnv, n_actions: int) -> list[str]:
-    """:return: the environment's names of its actions, or else their numbers"""
+    """The environment's names of its actions, or else their numbers."""
     world = env.get_attr("unwrapped", 0)[0]
     names = world.get_action_meanings() if hasattr(world, "get_action_meanings") else []
     return list(names) if len(names) == n_actions else [str(a) for a in range(n_actions)]
 
 
 def factor_names(env: VecEnv) -> list[str]:
-    """
-    :param env: the environment, after a reset
-    :return: names of the factors that the environment reports, in the order of :class:`~sb3_eqr.visualize.latents.Play`
-    """
+    """Names of the factors that an environment reported at its last reset, in the order of ``Play``."""
     info = env.unwrapped.reset_infos[0]
     sizes = {key: getattr(info[key], "size", 1) for key in FACTOR_KEYS if key in info}
     return [key if size == 1 else f"{key} {i}" for key, size in sizes.items() for i in range(size)]

@@ -1,5 +1,7 @@
 """Deterministic functions of tensors for the diagnostics: errors, correlations, information, rank."""
 
+from collections.abc import Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +11,7 @@ ROUNDING = 1e-6  # relative variation below this is rounding in single precision
 RANK_TOLERANCE = 1e-3  # directions in which a block varies by less than this fraction of its largest are ignored
 BINS = 10  # of a true factor
 CELLS = 32  # of a block
+OPPOSITE = -0.8  # largest cosine between the effects of two actions that undo each other
 
 
 class Transition(NamedTuple):
@@ -41,16 +44,10 @@ def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Te
     :param mask: (N, M), 1 where the window counts
     """
     rows = []
-    for m in range(mask.shape[1]):
-        valid = mask[:, m] > 0
-        start, true, guess = (x[valid].double() for x in (states, next_states[:, m], predicted[:, m]))  # (n, D) each
-        if not len(true):
-            rows.append((np.nan, np.nan, np.nan, np.nan, 0))
-            continue
+    for start, true, guess in _valid(mask, states[:, None].expand_as(next_states), next_states, predicted):  # (n, D) each
+        error, still, size = (float(x.square().sum(dim=1).mean()) for x in (guess - true, start - true, true))
         shift = (guess.mean(dim=0) - true.mean(dim=0)).square().sum()
-        shuffled = guess.var(dim=0, correction=0).sum() + true.var(dim=0, correction=0).sum() + shift
-        error, still = (_mean_square(x, true) for x in (guess, start))
-        rows.append((error, float(shuffled), still, float(true.square().sum(dim=1).mean()), len(true)))
+        rows.append((error, float(_variance(guess).sum() + _variance(true).sum() + shift), still, size, len(true)))
     error, shuffled, still, size, n = np.array(rows, dtype=np.float64).T  # (M,) each
     floor = ROUNDING**2 * size
     return Transition(error, shuffled, still, _one_less(error, shuffled, floor), _one_less(error, still, floor), n.astype(int))
@@ -58,40 +55,36 @@ def transition_error(states: th.Tensor, next_states: th.Tensor, predicted: th.Te
 
 def reward_error(predicted: th.Tensor, rewards: th.Tensor, mask: th.Tensor) -> Rewards:
     """
-    Reward prediction compared with the constant mean; the explained variance is defined as in SB3.
-
-    :param predicted: (N, M)
-    :param rewards: (N, M)
-    :param mask: (N, M), 1 where the window counts
+    Reward prediction, (N, M), compared with the constant mean, where the mask, (N, M), is 1; the explained variance is defined
+    as in SB3.
     """
-    rows = []
-    for m in range(mask.shape[1]):
-        valid = mask[:, m] > 0
-        guess, true = predicted[valid, m].double(), rewards[valid, m].double()
-        error = true - guess
-        variance = float(true.var(correction=0)) if len(true) else np.nan
-        left = float(error.var(correction=0)) if len(true) else np.nan
-        rows.append((float(error.square().mean()), variance, left))
+    errors = [(true - guess, true) for guess, true in _valid(mask, predicted, rewards)]  # (n,) each
+    rows = [(float(error.square().mean()), float(_variance(true)), float(_variance(error))) for error, true in errors]
     found, constant, left = np.array(rows).T
     return Rewards(found, constant, _one_less(left, constant, np.full_like(constant, ROUNDING**2)))
 
 
-def _mean_square(left: th.Tensor, right: th.Tensor) -> float:
-    return float((left - right).square().sum(dim=1).mean())
+def _valid(mask: th.Tensor, *values: th.Tensor) -> Iterator[list[th.Tensor]]:
+    """For each step ahead, the rows of values, (N, M, ...), whose window counts."""
+    for m in range(mask.shape[1]):
+        yield [x[mask[:, m] > 0, m].double() for x in values]
+
+
+def _variance(x: th.Tensor) -> th.Tensor:
+    """The variance over rows; NaN without rows, without PyTorch's warning."""
+    return x.var(dim=0, correction=0) if len(x) else x.mean(dim=0)
 
 
 def _one_less(numerator: np.ndarray, denominator: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """:return: 1 − numerator / denominator, NaN where the denominator is only rounding"""
+    """1 − numerator / denominator, NaN where the denominator is only rounding."""
     known = denominator > floor
     return np.where(known, 1 - numerator / np.where(known, denominator, 1), np.nan)
 
 
 def angle_moments(angles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Circular mean and standard deviation, √(−2 ln R) with R the length of the mean unit vector (Mardia and Jupp 2000, §2.3).
-
-    :param angles: radians, (N, ...)
-    :return: (...), (...)
+    Circular mean and standard deviation, √(−2 ln R) with R the length of the mean unit vector (Mardia and Jupp 2000, §2.3), of
+    angles in radians, over their first axis.
     """
     sin, cos = angles.double().sin().mean(dim=0), angles.double().cos().mean(dim=0)
     length = th.hypot(sin, cos).clamp(min=1e-12, max=1)
@@ -100,42 +93,36 @@ def angle_moments(angles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def concentration(weights: np.ndarray, axis: int) -> np.ndarray:
     """
-    1 − H / log n of the weights normalised to sum to 1: 1 if one entry has all the weight, 0 if all entries are equal.
-
-    :param weights: ≥ 0
-    :param axis: axis of the n entries
-    :return: the weights' shape without that axis; NaN where n is 1 or all weights are 0
+    1 − H / log n of n weights ≥ 0 along an axis, normalised to sum to 1: 1 if one has all the weight, 0 if all are equal, NaN
+    if n is 1 or all are 0.
     """
-    total = weights.sum(axis=axis, keepdims=True)
-    n = weights.shape[axis]
+    total, n = weights.sum(axis=axis, keepdims=True), weights.shape[axis]
     if n < 2:
         return np.full(total.squeeze(axis).shape, np.nan)
     p = np.where(total > 0, weights / np.where(total > 0, total, 1), np.nan)
-    log_p = np.log(np.where(p > 0, p, 1))
-    return 1 + (p * log_p).sum(axis=axis) / np.log(n)
+    return 1 + _p_log_p(p).sum(axis=axis) / np.log(n)
 
 
-def opposites(generators: np.ndarray, least: float = 0.8) -> list[int]:
+def _p_log_p(p: np.ndarray) -> np.ndarray:
+    return p * np.log(np.where(p > 0, p, 1))
+
+
+def opposites(generators: np.ndarray) -> list[int]:
     """
-    Pairs of actions that undo each other: each has the lowest cosine with the other, and it is below −``least``.
+    Pairs of actions that undo each other: each has the lowest cosine with the other, and it is below ``OPPOSITE``.
 
     :param generators: mean coordinates of each action's element, (A, C)
-    :param least: threshold of the cosine
     :return: for each action its opposite, or the action itself, (A,)
     """
     norms = np.linalg.norm(generators, axis=1, keepdims=True)
     unit = generators / np.where(norms > 0, norms, 1)
     cosine = unit @ unit.T  # (A, A)
     nearest = cosine.argmin(axis=1)
-    return [int(b) if nearest[b] == a and cosine[a, b] < -least else a for a, b in enumerate(nearest)]
+    return [int(b) if nearest[b] == a and cosine[a, b] < OPPOSITE else a for a, b in enumerate(nearest)]
 
 
 def merged(weights: np.ndarray, pairs: list[int]) -> np.ndarray:
-    """
-    :param weights: (A, K)
-    :param pairs: see :func:`opposites`
-    :return: (A', K), each action averaged with its opposite
-    """
+    """Weights of actions, (A, K), each action averaged with its opposite (see :func:`opposites`), (A', K)."""
     return np.stack([(weights[a] + weights[b]) / 2 for a, b in enumerate(pairs) if a <= b])
 
 
@@ -147,38 +134,31 @@ def canonical_correlations(blocks: list[th.Tensor]) -> np.ndarray:
     :param blocks: K of (N, d), each with its own d
     :return: (K, K), in [0, 1], 1 on the diagonal; 0 if either is constant
     """
-    bases = [_directions(x) for x in blocks]
-    found = np.eye(len(bases))
-    for i, first in enumerate(bases):
-        for j, second in enumerate(bases[:i]):
-            rank = min(first.shape[1], second.shape[1])
-            if rank:
-                found[i, j] = found[j, i] = float(th.linalg.svdvals(first.T @ second)[:rank].clamp(max=1).mean())
+    found = np.eye(len(blocks))
+    for (j, second), (i, first) in combinations(enumerate(map(_directions, blocks)), 2):
+        values = th.linalg.svdvals(first.T @ second).clamp(max=1)
+        found[i, j] = found[j, i] = float(values.mean()) if len(values) else 0
     return found
 
 
 def _directions(x: th.Tensor) -> th.Tensor:
-    """:return: an orthonormal basis of the variation, (N, rank)"""
+    """An orthonormal basis, (N, rank), of the variation of (N, d)."""
     x = x.double()
-    centred = x - x.mean(dim=0)
-    left, values, _ = th.linalg.svd(centred, full_matrices=False)
+    left, values, _ = th.linalg.svd(x - x.mean(dim=0), full_matrices=False)
     kept = (values > RANK_TOLERANCE * values[0]) & (values > ROUNDING * th.linalg.matrix_norm(x))
     return left[:, kept]
 
 
 def bins(values: np.ndarray, n_bins: int = BINS) -> np.ndarray:
     """
-    Bins with about equally many values each. Angles need no special treatment, since a circle may be cut anywhere.
-
-    :param values: (N,)
-    :param n_bins: maximum number of bins
-    :return: labels, (N,), int
+    Labels of at most ``n_bins`` bins with about equally many values each, (N,), int, of values, (N,). Angles need no special
+    treatment, since a circle may be cut anywhere.
     """
     edges = np.unique(np.quantile(values, np.linspace(0, 1, n_bins + 1)[1:-1]))
     return np.searchsorted(edges, values, side="right")
 
 
-def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np.ndarray:
+def cells(points: th.Tensor, n_cells: int = CELLS) -> np.ndarray:
     """
     Bins in any number of dimensions: k-means (Lloyd 1982), initialised with points that are each the farthest from the
     previous ones. Applied to the entries of a rotation, it has no discontinuity on the circle.
@@ -197,7 +177,7 @@ def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np
         chosen.append(int(nearest.argmax()))
         nearest = th.minimum(nearest, (x - x[chosen[-1]]).square().sum(dim=1))
     centres = x[chosen]
-    for _ in range(n_iterations):
+    for _ in range(10):
         labels = th.cdist(x, centres).argmin(dim=1)  # (N,)
         counts = th.bincount(labels, minlength=n_cells)[:, None]
         sums = th.zeros_like(centres).index_add_(0, labels, x)
@@ -206,23 +186,13 @@ def cells(points: th.Tensor, n_cells: int = CELLS, n_iterations: int = 10) -> np
 
 
 def entropy(labels: np.ndarray) -> float:
-    """
-    Entropy in nats, with Miller's (1955) correction for few samples: (occupied labels − 1) / 2N is added.
-
-    :param labels: (N,), int
-    """
+    """Entropy in nats, with Miller's (1955) correction for few samples: (occupied labels − 1) / 2N is added."""
     _, counts = np.unique(labels, return_counts=True)
-    p = counts / len(labels)
-    return float(-(p * np.log(p)).sum() + (len(counts) - 1) / (2 * len(labels)))
+    return float(-_p_log_p(counts / len(labels)).sum() + (len(counts) - 1) / (2 * len(labels)))
 
 
 def mutual_information(first: np.ndarray, second: np.ndarray) -> float:
-    """
-    I = H(a) + H(b) − H(a, b), in nats; at least 0.
-
-    :param first: labels a, (N,), int ≥ 0
-    :param second: labels b, (N,), int ≥ 0
-    """
+    """I = H(a) + H(b) − H(a, b) of labels a and b, (N,), int ≥ 0, in nats; at least 0."""
     joint = first * (int(second.max()) + 1) + second
     return max(entropy(first) + entropy(second) - entropy(joint), 0.0)
 
@@ -237,20 +207,17 @@ def information_gap(information: np.ndarray) -> np.ndarray:
     """
     if len(information) < 2:
         return np.full(information.shape[1], np.nan)
-    ordered = np.sort(information, axis=0)
-    return ordered[-1] - ordered[-2]
+    *_, second, best = np.sort(information, axis=0)
+    return best - second
 
 
 def spectrum(states: th.Tensor) -> np.ndarray:
-    """
-    :param states: (N, D)
-    :return: singular values of the centred states over √N, (min(N, D),): standard deviations along the principal axes
-    """
+    """Standard deviations of states, (N, D), along their principal axes, (min(N, D),): singular values over √N."""
     x = states.double()
     return th.linalg.svdvals((x - x.mean(dim=0)) / len(x) ** 0.5).cpu().numpy()
 
 
-def effective_rank(values: np.ndarray, size: float = 0.0) -> float:
+def effective_rank(values: np.ndarray, size: float) -> float:
     """
     exp of the entropy of the normalised singular values (Roy and Vetterli 2007).
 
@@ -259,10 +226,7 @@ def effective_rank(values: np.ndarray, size: float = 0.0) -> float:
     :return: in [1, len(values)]; 0 if no value is left
     """
     counted = values[values > ROUNDING * size]
-    if not counted.sum():
-        return 0.0
-    p = counted / counted.sum()
-    return float(np.exp(-(p * np.log(np.where(p > 0, p, 1))).sum()))
+    return float(np.exp(-_p_log_p(counted / counted.sum()).sum())) if counted.sum() else 0.0
 
 
 def mean_of_known(values: np.ndarray) -> float:

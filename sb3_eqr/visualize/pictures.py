@@ -1,31 +1,32 @@
-"""
-Figures of the diagnostics, at 6×4 inches. They need no display, and do not use matplotlib's ``pyplot``, so they need not be
-closed.
-"""
+"""Figures, at 6×4 inches. They need no display, and do not use matplotlib's ``pyplot``, so they need not be closed."""
 
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import ArrayLike
 
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.groups import SO, Group
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, styled
-from sb3_eqr.visualize.diagnostics import Diagnostics, Generators
-from sb3_eqr.visualize.latent_figure import MAX_PANELS, SIZE, latent_figure, make_axes, n_columns
+from sb3_eqr.visualize.diagnostics import Diagnostics
+from sb3_eqr.visualize.findings import Generators
+from sb3_eqr.visualize.latents import each_block, frame, names_of_factors
 from sb3_eqr.visualize.measures import ROUNDING, Transition
-from sb3_eqr.visualize.tables import factor_names
 
-__all__ = ["all_pictures", "latent_figure", "write_pictures"]
-
-DPI = 150
+SIZE, DPI = (6.0, 4.0), 150  # SIZE: inches
+MAX_PANELS, MAX_POINTS, MAX_ARROWS = 12, 400, 150  # of the latent states; MAX_PANELS also of the generators
+ABOUT = "A point per state: a block's translation, an arrow for its rotation, or its principal components."
 MAX_COORDINATES = 6  # of a block, in one panel
-MAX_NUMBERS = 36  # printed in a heat map
-MAX_NUMBER_COLUMNS = 6  # with more, the numbers would overlap
+MAX_NUMBERS, MAX_NUMBER_COLUMNS = 36, 6  # printed in a heat map; with more columns, the numbers would overlap
 PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # instead of powers of ten
 COORDINATES = {"angle": "angle in a plane (radians)", "a": "matrix entry a", "t": "translation t", "x": "entry x"}
 MAX_LETTERS = 72  # of horizontal tick labels at the bottom of a figure
@@ -39,14 +40,16 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
     :return: name of the file without suffix -> figure
     """
     with styled():
-        return {
+        figures = {
             "transition": transition_figure(diagnostics),
             "motion": motion_figure(diagnostics, actions),
             "generators": generators_figure(diagnostics, actions),
             "disentanglement": disentanglement_figure(diagnostics, factors),
             "collapse": spectrum_figure(diagnostics),
-            **({"rewards": rewards_figure(diagnostics)} if has_rewards(diagnostics) else {}),
         }
+        if diagnostics.rewards_trained and not np.isnan(diagnostics.rewards.explained).all():  # NaN if rewards do not vary
+            figures["rewards"] = rewards_figure(diagnostics)
+        return figures
 
 
 def write_pictures(figures: dict[str, Figure], folder: pathlib.Path) -> None:
@@ -98,8 +101,8 @@ def motion_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
         _block_ticks(ax, diagnostics.blocks)
     axes[0].set_yticks(range(len(actions)), actions, fontsize=8 if len(actions) < 12 else 6)
     axes[0].set_ylabel("action")
-    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
-    bar.set_label("mean distance that an action moves a block (grey: the action was not played)")
+    label = "mean distance that an action moves a block (grey: the action was not played)"
+    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60, label=label)
     return figure
 
 
@@ -108,41 +111,38 @@ def _heat_map(ax: Axes, values: np.ndarray, title: str, top: float) -> AxesImage
     image = ax.imshow(np.ma.masked_invalid(values), cmap="viridis", aspect="auto", interpolation="nearest", vmin=0, vmax=top)
     if values.size <= MAX_NUMBERS and values.shape[1] <= MAX_NUMBER_COLUMNS:
         for (row, column), value in np.ndenumerate(values):
-            dark = value < 0.6 * top
-            ax.text(column, row, f"{value:.2g}", ha="center", va="center", color="white" if dark else "black")
+            color = "white" if value < 0.6 * top else "black"
+            ax.text(column, row, f"{value:.2g}", ha="center", va="center", color=color)
     ax.set_title(title, loc="left")
     return image
 
 
 def _block_ticks(ax: Axes, blocks: Sequence[str]) -> None:
-    every = -(-len(blocks) // 12)
-    ax.set_xticks(range(0, len(blocks), every), [str(k) for k in range(0, len(blocks), every)])
+    shown = range(0, len(blocks), -(-len(blocks) // 12))
+    ax.set_xticks(shown, [str(k) for k in shown])
     groups = list(dict.fromkeys(block.rsplit(" ", 1)[0] for block in blocks))
     ax.set_xlabel(f"block ({', '.join(groups)})")
 
 
 def generators_figure(diagnostics: Diagnostics, actions: Sequence[str]) -> Figure:
     """A panel per block: the coordinates of κ(x, a) for every action, mean and standard deviation over states."""
-    motion = diagnostics.motion.predicted.sum(axis=0)  # (K,)
-    shown = sorted(np.argsort(-motion, kind="stable")[:MAX_PANELS])
+    shown, part_of_all = _largest(diagnostics.motion.predicted.sum(axis=0), "it moves most")
     places = [(part, k) for part in diagnostics.generators for k in range(part.mean.shape[1])]
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = make_axes(figure, len(shown), sharey=True)
     drawn: dict[str, Any] = {}
     for ax, block in zip(axes, shown, strict=True):
-        part, k = places[block]
-        _generator(ax, part, k, drawn)
+        _generator(ax, *places[block], drawn)
         ax.set_title(diagnostics.blocks[block], loc="left", pad=2)
         ax.set_xticks(range(len(actions)), [])
+    labels = actions if len(actions) <= 6 else [str(a) for a in range(len(actions))]
+    upright = max(map(len, labels)) * len(labels) * n_columns(len(axes)) > MAX_LETTERS
     for ax in axes[-n_columns(len(axes)) :]:
-        labels = actions if len(actions) <= 6 else [str(a) for a in range(len(actions))]
-        upright = max(map(len, labels)) * len(labels) * n_columns(len(axes)) > MAX_LETTERS
         ax.set_xlabel("action")
         ax.set_xticks(range(len(actions)), labels, rotation=90 if upright else 0, fontsize=7 if len(actions) <= 9 else 5)
     figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn) if len(drawn) < 5 else 3)
     kinds = {name.split(" ")[0] for part in diagnostics.generators for name in part.names}
     figure.supylabel("coordinate: " + ", ".join(text for kind, text in COORDINATES.items() if kind in kinds), fontsize=9)
-    part_of_all = "" if len(shown) == len(places) else f" ({len(shown)} of {len(places)} blocks, those it moves most)"
     figure.suptitle(f"What each action does: coordinates of κ(x, a){part_of_all}", fontsize=10)
     return figure
 
@@ -169,12 +169,12 @@ def disentanglement_figure(diagnostics: Diagnostics, factors: Sequence[str] = ()
     axes[0].set_yticks(axes[0].get_xticks())
     axes[0].set_ylabel("block")
     if found.information is not None:
-        names = factor_names(found.information.shape[1], factors)
         _heat_map(axes[1], found.information.T, "information about true factors", 1)
         _block_ticks(axes[1], diagnostics.blocks)
-        axes[1].set_yticks(range(len(names)), names)
-    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60)
-    bar.set_label("0: independent, 1: one determines the other")
+        n_factors = found.information.shape[1]
+        axes[1].set_yticks(range(n_factors), names_of_factors(n_factors, factors))
+    label = "0: independent, 1: one determines the other"
+    figure.colorbar(image, ax=axes, location="bottom", shrink=0.9, aspect=60, label=label)
     return figure
 
 
@@ -197,18 +197,10 @@ def spectrum_figure(diagnostics: Diagnostics) -> Figure:
         ax.yaxis.set_major_formatter(PLAIN)
         ax.set_ylim(seen[-1] / 2, 2 * seen[0])
     ax.legend()
-    units = f"{found.dead_units:.0%} of the trunk's {found.n_units} units are constant (dead)"
-    ax.set_title(
-        f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n"
-        f"{units}, {found.dormant_units:.0%} nearly 0 (dormant)",
-        loc="left",
-    )
+    title = f"Spectrum of the latent states, whose spread is {found.spread:.1%} of their size;\n{found.dead_units:.0%} of the "
+    title += f"trunk's {found.n_units} units are constant (dead), {found.dormant_units:.0%} nearly 0 (dormant)"
+    ax.set_title(title, loc="left")
     return figure
-
-
-def has_rewards(diagnostics: Diagnostics) -> bool:
-    """:return: whether the reward predictor was trained and rewards vary"""
-    return diagnostics.rewards_trained and not np.isnan(diagnostics.rewards.explained).all()
 
 
 def rewards_figure(diagnostics: Diagnostics) -> Figure:
@@ -225,3 +217,104 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
     right.set_title("explained variance (1: exact)", loc="left")
     figure.suptitle("Reward prediction", fontsize=10)
     return figure
+
+
+def latent_figure(
+    model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", is_periodic: bool = False
+) -> Figure:
+    """
+    A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in
+    Figure 3 of the paper); SE(2) and T(2) are points in the plane, with the direction of any rotation; a single number is
+    plotted over the windows; anything else is projected to its first two principal components.
+
+    :param model: the agent
+    :param states: see :func:`~sb3_eqr.visualize.latents.encode`, (N, D)
+    :param values: values for the colours, (N,); default: the order of the states
+    :param label: label of the colours
+    :param is_periodic: whether the smallest and the largest of the values are the same, so that they get the same colour
+    """
+    kept = np.unique(np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int))
+    colours = (np.arange(len(states)) if values is None else np.asarray(values))[kept]
+    chosen = states[th.as_tensor(kept, device=states.device)].cpu()
+    blocks = each_block(model, chosen)
+    spreads = np.array([float(found.flatten(1).double().std(dim=0, correction=0).norm()) for *_, found in blocks])
+    shown, part_of_all = _largest(spreads, "that vary most")
+    with styled():
+        figure = Figure(figsize=SIZE)  # a constrained layout would take longer than the drawing itself
+        axes = make_axes(figure, len(shown))
+        for ax, i in zip(axes, shown, strict=True):
+            name, group, found = blocks[i]
+            constant = spreads[i] <= ROUNDING * float(found.norm()) / len(found) ** 0.5
+            drawn = _draw(ax, group, found, colours, "twilight" if is_periodic else "viridis")
+            about = " (constant)" if constant else _outside(ax, drawn.get_offsets())
+            ax.set_title(f"{name}{about}", loc="left", fontsize=8, pad=3)
+            ax.tick_params(labelsize=6, length=2, pad=1)
+        figure.subplots_adjust(left=0.07, right=0.85, bottom=0.07, top=0.87, wspace=0.35, hspace=0.45)
+        label = "time (steps)" if label == "time" else label
+        figure.colorbar(drawn, cax=figure.add_axes((0.88, 0.12, 0.02, 0.7)), label=label)
+        figure.suptitle(f"Latent states{part_of_all}", fontsize=10)
+        figure.text(0.46, 0.005, ABOUT, ha="center", fontsize=7, color=GREY)
+        return figure
+
+
+def _largest(sizes: np.ndarray, which: str) -> tuple[list[int], str]:
+    """The indices of the blocks with a panel, and the end of the title, given the size of each block, (K,)."""
+    shown = sorted(np.argsort(-sizes, kind="stable")[:MAX_PANELS].tolist())
+    return shown, "" if len(shown) == len(sizes) else f" ({len(shown)} of {len(sizes)} blocks, those {which})"
+
+
+def n_columns(count: int) -> int:
+    """Number of columns for a number of panels."""
+    return 4 if count > 4 else min(count, 2)
+
+
+def make_axes(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
+    """A number of axes, in rows of at most four."""
+    columns = n_columns(count)
+    axes = figure.subplots(-(-count // columns), columns, squeeze=False, sharey=sharey).flatten().tolist()
+    for unused in axes[count:]:
+        unused.remove()
+    return axes[:count]
+
+
+def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap: str) -> PathCollection:
+    """Draw the elements of one block, (n, *element_shape), in colours, (n,); returns the points, for the colour bar."""
+    low, high = float(colours.min()), float(colours.max())
+    matrix, vector = frame(group, elements)
+    if isinstance(group, SO) and group.n == 2:
+        turn = np.linspace(0, 2 * np.pi, 100)
+        ax.plot(np.cos(turn), np.sin(turn), color=GREY, linewidth=0.5, zorder=0)
+        points = elements[:, :, 0].numpy()
+        ax.set(aspect="equal", xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), xticks=(-1, 0, 1), yticks=(-1, 0, 1))
+    elif vector is not None and vector.shape[-1] == 2:
+        points = vector.numpy()
+        if matrix is not None:
+            few = slice(None, None, -(-len(points) // MAX_ARROWS))
+            arrows = matrix[few, :, 0].numpy()
+            looks: Any = {"clim": (low, high), "cmap": cmap, "width": 0.006, "scale": 10, "alpha": 0.6}
+            ax.quiver(*points[few].T, *arrows.T, colours[few], **looks)
+        _roomy(ax, points)
+    elif elements[0].numel() == 1:
+        points = np.stack([np.arange(len(elements)), elements.flatten().numpy()], axis=1)
+    else:  # the first two principal components
+        x = elements.flatten(1).double()
+        left, values, _ = th.linalg.svd(x - x.mean(dim=0), full_matrices=False)
+        points = (left[:, :2] * values[:2]).numpy()
+        _roomy(ax, points)
+    return ax.scatter(points[:, 0], points[:, 1], c=colours, s=6, linewidths=0, vmin=low, vmax=high, cmap=cmap)
+
+
+def _roomy(ax: Axes, points: np.ndarray) -> None:
+    """Equal scales, without zooming in on rounding or out to an episode's few first states (the title counts them)."""
+    low, high = np.percentile(points, (1, 99), axis=0)  # (2,) each
+    middle = (low + high) / 2
+    half = max(0.7 * float((high - low).max()), 1e-6 * float(np.abs(middle).max()), 1e-9)
+    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+    ax.locator_params(axis="x", nbins=1)
+    ax.locator_params(axis="y", nbins=2)
+
+
+def _outside(ax: Axes, points: ArrayLike) -> str:
+    low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    count = int(((np.asarray(points) < low) | (np.asarray(points) > high)).any(axis=1).sum())
+    return f" ({count} outside)" if count else ""

@@ -12,8 +12,8 @@ from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.groups import Group
 from sb3_eqr.envs import SlidingBall, make_atari100k_env
 from sb3_eqr.visualize.diagnostics import diagnose
-from sb3_eqr.visualize.latent_figure import latent_figure
 from sb3_eqr.visualize.latents import coordinate_names, coordinates, encode, frame, play
+from sb3_eqr.visualize.pictures import latent_figure
 from tests.toys import ChainEnv
 
 sb3_eqr.envs.register()
