@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -30,7 +30,6 @@ from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 LARGEST_DATA = 100 << 20  # bytes of a model's attributes
 MEMORY_PER_BYTE = 8  # of a file: both target copies, and what their initialisation needs
 
-SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
 FileOrPath = str | pathlib.Path | io.BufferedIOBase
 
 
@@ -102,10 +101,7 @@ def data_of(content: bytes) -> dict[str, Any]:
 
 
 class LimitedMemory(TorchDispatchMode):
-    """
-    Raises ValueError when new tensors would take more than ``n_bytes``: a file holds all parameters of the agent that it
-    describes, so it cannot be much smaller.
-    """
+    """Raises ValueError when new tensors take more than ``n_bytes``: a file holds the parameters of the agent it describes."""
 
     def __init__(self, n_bytes: int):
         super().__init__()
@@ -173,7 +169,7 @@ class SafeFiles(OffPolicyAlgorithm):
 
     @classmethod
     def load(
-        cls: type[SelfSafeFiles],
+        cls,
         path: FileOrPath,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
@@ -182,7 +178,7 @@ class SafeFiles(OffPolicyAlgorithm):
         force_reset: bool = True,
         trust: bool = False,
         **kwargs: Any,
-    ) -> SelfSafeFiles:
+    ) -> Self:
         """
         As SB3's ``load``, with the same parameters, and ``trust``. If the model has a seed (and no other is given), the random
         generators are restored, so a run that was saved after ``learn``, or between two rollouts, can be resumed exactly (pass
@@ -209,19 +205,13 @@ class SafeFiles(OffPolicyAlgorithm):
         with LimitedMemory(MEMORY_PER_BYTE * len(content) + LARGEST_DATA):
             file: Any = io.BytesIO(content)
             model = super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
-        reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
-        if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
+        is_reseeded = "seed" in kwargs or "seed" in given
+        if model.seed is not None and not is_reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
         return model
 
     @classmethod
-    def resume(
-        cls: type[SelfSafeFiles],
-        path: str | pathlib.Path,
-        env: GymEnv,
-        device: th.device | str = "auto",
-        trust: bool = False,
-    ) -> SelfSafeFiles:
+    def resume(cls, path: str | pathlib.Path, env: GymEnv, device: th.device | str = "auto", trust: bool = False) -> Self:
         """
         Resume from a checkpoint of :class:`~sb3_eqr.common.saving.checkpoints.ExactCheckpointCallback`, bit for bit as if
         the run had not stopped. Then call ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
@@ -230,7 +220,6 @@ class SafeFiles(OffPolicyAlgorithm):
         :param env: environment built as in the original run, including VecNormalize
         :param device: as in ``load``
         :param trust: as in ``load``
-        :return: the agent
         :raises ValueError: if there is no complete checkpoint, or one of its files has changed
         """
         if env is None:
