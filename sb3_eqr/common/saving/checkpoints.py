@@ -36,6 +36,7 @@ def write_checkpoint(
     :param folder: folder of the checkpoints
     :param notes: additional plain data to store
     :param keep: number of checkpoints to keep, including this one
+    :param with_buffer: whether to include the replay buffer
     """
     env = model.get_env()
     assert env is not None

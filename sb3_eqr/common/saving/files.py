@@ -66,7 +66,7 @@ def checksum(file: BinaryIO, size: int) -> str:
 
 
 def seal(file: BinaryIO) -> None:
-    """Append the checksum of an open zip file as its comment, because the checksums of the format do not cover headers."""
+    """Append its checksum to a zip file, open for reading and writing, as its comment: those of the format omit headers."""
     end = file.seek(-2, os.SEEK_END) + 2  # the last two bytes hold the length of the comment
     file.write(struct.pack("<H", len(SEAL) + 64))
     file.write(SEAL + checksum(file, end).encode())
