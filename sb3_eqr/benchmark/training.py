@@ -268,13 +268,12 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     )
     if isinstance(model, OffPolicyAlgorithm) and (checkpoint / checkpoints.BUFFER).is_file():
         model.load_replay_buffer(checkpoint / checkpoints.BUFFER, **trust)
-    checkpoints.restore_environment(model, manifest, is_exact)
+    checkpoints.restore_run(model, manifest, is_exact)
     if not is_exact:
         buffer: Any = getattr(model, "replay_buffer", None)
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
             last = buffer.pos - 1
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])  # a terminal state stays one
-    checkpoints.restore_generators(model, manifest)
     is_exact &= not getattr(model, "use_sde", False)  # the noise of the next rollout was drawn before the checkpoint
     return model, decode(manifest["notes"]), is_exact
 

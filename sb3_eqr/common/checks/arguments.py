@@ -161,11 +161,7 @@ def option(default: Any, rule: Rule) -> Any:
 
 
 def with_fields_of(options: type) -> Callable[[Any], Any]:
-    """
-    A decorator that shows the fields of a dataclass in the signature of a function, in place of its ``**kwargs``.
-
-    :param options: the dataclass
-    """
+    """A decorator that shows the fields of a dataclass in the signature of a function, in place of its ``**kwargs``."""
 
     def decorate(function: Any) -> Any:
         found = inspect.signature(function)
@@ -184,41 +180,24 @@ def rules_of(options: Any) -> dict[str, Rule]:
 
 
 def check_fields(options: Any, prefix: str = "") -> None:
-    """
-    :param options: an instance of a dataclass
-    :param prefix: prefix of each name in messages
-    :raises ValueError: for the first field with an illegal value
-    """
+    """As :func:`check_arguments`, for the fields of an instance of a dataclass."""
     check_arguments(vars(options), rules_of(options), prefix)
 
 
 def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
-    """
-    :param cutoff: least similarity, in [0, 1]
-    :return: the end of a message: a question with the closest legal name, or ""
-    """
+    """The end of a message: a question with the closest legal name, or "" if none has at least the similarity ``cutoff``."""
     found = get_close_matches(name, list(legal), n=1, cutoff=cutoff)
     return f" Did you mean {found[0]!r}?" if found else ""
 
 
 def check(name: str, value: Any, rule: Rule) -> None:
-    """
-    :param name: name of the argument for the message
-    :param value: its value
-    :param rule: the rule for its values
-    :raises ValueError: if the rule does not hold for the value
-    """
+    """Raise ValueError if the rule does not hold for the value of the argument ``name``."""
     if not rule.holds(value):
         raise ValueError(f"{name} must be {rule.says}, got {value!r}.")
 
 
 def check_arguments(values: Mapping[str, Any], rules: Mapping[str, Rule], prefix: str = "") -> None:
-    """
-    :param values: values by name; values without a rule are not checked
-    :param rules: one of the tables above
-    :param prefix: prefix of each name in messages
-    :raises ValueError: for the first illegal value
-    """
+    """Raise ValueError for the first illegal value; those without a rule are legal. Messages put ``prefix`` before names."""
     for name, rule in rules.items():
         if name in values:
             check(prefix + name, values[name], rule)

@@ -4,7 +4,6 @@ import warnings
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
@@ -76,19 +75,11 @@ class FiniteData(OffPolicyAlgorithm):
             )
         self.trained_normalized = self._vec_normalize_env is not None
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         """As SB3's; the buffer refuses what is not finite, and then the statistics of VecNormalize are as before."""
         self._stored_steps = self.num_timesteps
         try:
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            super()._store_transition(*args, **kwargs)
         except ValueError as error:
             self._last_obs = None  # the environment has already stepped, so the next call of learn must reset it
             for part, saved in zip(_running_means(self._vec_normalize_env), self._statistics, strict=True):

@@ -9,9 +9,8 @@ from torch import nn
 
 class UpdateMonitor:
     """
-    Collect the metrics of each update. They stay on the device until the next round of updates, so no update waits for them.
-
-    :param model: model whose parameters and buffers are checked
+    Collects the metrics of each update of ``model``. They stay on the device until the next round of updates, so no update
+    waits for them.
     """
 
     def __init__(self, model: nn.Module):
@@ -34,12 +33,7 @@ class UpdateMonitor:
         self._pending.append(th.stack(list(metrics.values())))
 
     def collect(self) -> list[dict[str, float]]:
-        """
-        Read the metrics of the last round.
-
-        :return: those of each update, by name
-        :raises FloatingPointError: if a metric is NaN or infinite
-        """
+        """The metrics of each update of the last round, by name; raises FloatingPointError if one is NaN or infinite."""
         if not self._pending:
             return []
         metrics = th.stack(self._pending).cpu().numpy()  # (updates, metrics)
@@ -52,12 +46,7 @@ class UpdateMonitor:
         return [dict(zip(self._names, update, strict=True)) for update in metrics.tolist()]
 
     def check_model(self, n_updates: int) -> None:
-        """
-        Check that the parameters are finite after the last update, which its losses cannot show.
-
-        :param n_updates: number of updates so far
-        :raises FloatingPointError: if they are not finite
-        """
+        """Raise FloatingPointError if the parameters are not finite after ``n_updates``: the last losses cannot show it."""
         tensors = [tensor for tensor in self._model.state_dict().values() if tensor.is_floating_point() and tensor.numel()]
         found = th.stack(th._foreach_norm(tensors, float("inf"))).max().item()  # the largest absolute value
         if not np.isfinite(found):

@@ -19,20 +19,17 @@ from sb3_eqr.common.checks.arguments import POLICY, nearest
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
-
-
 # Code that processes the values that an environment returns.
 CONSUMERS = ("stable_baselines3/common/vec_env/", "stable_baselines3/common/monitor", "/gymnasium/")
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "sum")  # of PyTorch's fused optimisers
+OF_ENV = ("observation_space", "action_space", "n_envs")  # arguments of replay buffers
 
 
 @contextmanager
 def environment_errors(step: int) -> Iterator[None]:
     """
     An environment that violates gymnasium's interface causes errors in the code that processes the values it returns. Replace
-    them by an error that names the environment as the cause; errors of the environment's own code are unchanged.
-
-    :param step: number of steps so far
-    :raises ValueError: in place of such an error
+    them by a ValueError that names the environment as the cause; errors of the environment's own code are unchanged.
     """
     try:
         yield
@@ -189,26 +186,24 @@ def check_normalization(normalize: VecNormalize | None, observation_space: space
     Raise ValueError if a wrapper outside VecNormalize changes observations: the originals could not be stored; or if it
     normalises integers, whose terminal observations SB3 would cut to integers after it has scaled them back.
     """
-    if normalize is not None and normalize.norm_obs:
+    if normalize is None:
+        return
+    if normalize.norm_obs:
         inside = normalize.venv.observation_space
-        parts = (
-            {key: inside[key] for key in normalize.norm_obs_keys or []} if isinstance(inside, spaces.Dict) else {"": inside}
-        )
+        keys = normalize.norm_obs_keys or []
+        parts = {key: inside[key] for key in keys} if isinstance(inside, spaces.Dict) else {"": inside}
         if integers := [key for key, space in parts.items() if not np.issubdtype(space.dtype, np.floating)]:  # type: ignore[arg-type]
             of_keys = f" of {', '.join(map(repr, integers))}" if integers != [""] else ""
             raise ValueError(
                 f"VecNormalize must normalise floats, got integers{of_keys}. Pass norm_obs=False, or norm_obs_keys with the "
                 "other keys of a Dict; or put gymnasium.wrappers.DtypeObservation(env, np.float32) around the environment."
             )
-    if normalize is not None and normalize.observation_space != observation_space:
+    if normalize.observation_space != observation_space:
         raise ValueError(
             f"VecNormalize must be outside all wrappers that change observations, so that it can return the original ones, "
             f"got {normalize.observation_space} from VecNormalize and {observation_space} outside. "
             "Use VecNormalize(VecTransposeImage(env)) for images; on RL Zoo's command line, leave out normalize for them."
         )
-
-
-OF_ENV = ("observation_space", "action_space", "n_envs")  # arguments of replay buffers
 
 
 def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], set_by_owner: Iterable[str]) -> None:
@@ -277,16 +272,10 @@ def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> No
             )
 
 
-MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "sum")  # of PyTorch's fused optimisers
-
-
 def check_moments(optimizer: th.optim.Optimizer) -> None:
     """Raise ValueError if a loaded moment has not its parameter's shape and kind: a fused kernel would write beyond it."""
     for parameter, state in optimizer.state.items():
-        for name in MOMENTS:
-            value = state.get(name)
-            if not isinstance(value, th.Tensor):
-                continue
+        for name, value in [(name, state[name]) for name in MOMENTS if isinstance(state.get(name), th.Tensor)]:
             if value.shape != parameter.shape or value.is_floating_point() != parameter.is_floating_point():
                 raise ValueError(
                     f"{name} of the optimiser must have the shape of its parameter, {tuple(parameter.shape)}, got "

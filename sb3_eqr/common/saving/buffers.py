@@ -18,11 +18,7 @@ USED = ("_frames", "_references", "_free")  # arrays of a FrameStore, of which o
 
 
 def write_buffer(file: BinaryIO, buffer: Any, notes: dict[str, Any]) -> None:
-    """
-    :param file: open for writing
-    :param buffer: a replay buffer of this package, or of a derived class
-    :param notes: additional data to store, as JSON
-    """
+    """Write a replay buffer of this package, or of a derived class, with ``notes``, which are JSON, to an open file."""
     arrays: dict[str, np.ndarray] = {}
     state = {name: _packed(value, name, arrays) for name, value in vars(buffer).items()}
     with zipfile.ZipFile(file, "w") as archive:
@@ -34,9 +30,9 @@ def write_buffer(file: BinaryIO, buffer: Any, notes: dict[str, Any]) -> None:
 
 def read_buffer(file: BinaryIO, like: Any) -> tuple[Any, dict[str, Any]]:
     """
-    :param file: file written by :func:`write_buffer`, open for reading
+    Read the buffer and the notes from a file of :func:`write_buffer`, open for reading.
+
     :param like: a buffer of the same class, for the same spaces and number of environments
-    :return: the buffer and the notes
     :raises ValueError: if the file is truncated, modified, or of another kind
     """
     try:

@@ -30,15 +30,13 @@ def write_checkpoint(
     folder: pathlib.Path, model: BaseAlgorithm, notes: Any = None, keep: int = 1, with_buffer: bool = True
 ) -> pathlib.Path:
     """
-    Write a checkpoint. Call this between two rollouts, in a callback's ``_on_rollout_start``. A checkpoint of the same step is
-    not overwritten.
+    Write a checkpoint and return its path. Call this between two rollouts, in a callback's ``_on_rollout_start``. A checkpoint
+    of the same step is not overwritten.
 
     :param folder: folder of the checkpoints
-    :param model: an off-policy agent
     :param notes: additional plain data to store
     :param keep: number of checkpoints to keep, including this one
     :param with_buffer: whether to include the replay buffer
-    :return: path of the checkpoint
     """
     env = model.get_env()
     assert env is not None
@@ -82,10 +80,7 @@ def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def environment_of(model: BaseAlgorithm) -> dict[str, Any]:
-    """
-    What the first environment was made with: its id at gymnasium, or the name of its class, and gymnasium's arguments. Empty
-    where it is in another process, which would have to pickle it.
-    """
+    """The first environment's id or class, and gymnasium's arguments; empty in other processes, which would pickle them."""
     innermost = None if model.env is None else model.env.unwrapped
     if not isinstance(innermost, DummyVecEnv):
         return {}
@@ -149,11 +144,11 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     return found, manifest
 
 
-def restore_environment(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) -> None:
+def restore_run(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) -> None:
     """
-    Restore the state of environments that are built like those of the checkpoint. If it is not known completely, only that of
-    the vectorised wrappers is restored, such as the statistics of VecNormalize, and the agent begins a new episode. Its seed
-    depends on the step, so that the run's first episodes are not played again.
+    Restore the state of the environments and of the random generators. If that of the environments is not known completely,
+    only that of the vectorised wrappers is restored, such as the statistics of VecNormalize, and the agent begins a new
+    episode. Its seed depends on the step, so that the run's first episodes are not played again.
 
     :param model: the loaded agent, with its environments
     :param manifest: from :func:`read_manifest`
@@ -174,20 +169,7 @@ def restore_environment(model: BaseAlgorithm, manifest: dict[str, Any], is_exact
     if not is_exact:
         model._last_obs = None  # so that learn resets the environment
         env.seed(None if model.seed is None else model.seed + model.num_timesteps)
-
-
-def restore_generators(model: BaseAlgorithm, manifest: dict[str, Any]) -> None:
-    """Restore the state of the random generators."""
     set_rng_state(decode(manifest["rng"]), model.action_space)
-
-
-def warn_of_unknown(checkpoint: pathlib.Path, manifest: dict[str, Any]) -> None:
-    """Warn that a run is not resumed exactly."""
-    warnings.warn(
-        f"{checkpoint}: the state of {', '.join(manifest['unknown'][:3])} is not known, so training resumes with new "
-        "episodes, and does not continue bit for bit. Give the class state_dict and load_state_dict; in other processes, make "
-        "the environments with wrapper_class=sb3_eqr.envs.ResumableWrapper."
-    )
 
 
 class ExactCheckpointCallback(BaseCallback):
@@ -222,32 +204,28 @@ class ExactCheckpointCallback(BaseCallback):
                 "ExactCheckpointCallback: the agent must be one of this package, which can resume, got "
                 f"{type(self.model).__name__}. Use SB3's CheckpointCallback."
             )
-        self._check_folder()
-
-    def _check_folder(self) -> None:
-        """Raise ValueError if the folder holds checkpoints of another run, which would be mixed up with those of this run."""
         old = find_checkpoints(self.save_path)
         manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)
         other = [name for name in theirs if theirs[name] != ours.get(name)]
         step, last = self.model.num_timesteps, manifest.get("num_timesteps", 0)
-        why = ""
         if other:
             why = f"{other[0]} = {decode(theirs[other[0]])!r} there, {decode(ours.get(other[0]))!r} here"
         elif last > step == 0:  # resume would choose theirs, which has more steps
             why = f"it is at step {last}, this run begins"
         elif last > step and self.model.seed is None:
             why = "this run has no seed"
-        if why:
-            raise ValueError(
-                f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
-                "Pass another folder, or resume that run."
-            )
+        else:
+            return
+        raise ValueError(
+            f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
+            "Pass another folder, or resume that run."
+        )
 
     def _on_rollout_start(self) -> None:
         self._is_called = True
-        if self.model.num_timesteps // self.save_freq > self._last:
-            self._last = self.model.num_timesteps // self.save_freq
+        if (multiple := self.model.num_timesteps // self.save_freq) > self._last:
+            self._last = multiple
             checkpoint = write_checkpoint(self.save_path, self.model, keep=self.keep)
             if self.verbose:
                 print(f"Saving a checkpoint to {checkpoint}")

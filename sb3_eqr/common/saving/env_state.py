@@ -3,7 +3,6 @@ The state of environments as plain data: only the attributes that the table name
 them and names nothing; parameters of an environment, such as its time limit, belong to the one that the user passes.
 """
 
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -13,16 +12,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_eqr.common.saving.plain_data import decode, encode, without_pickles
 
-# One line per class: its attributes, each with its type. "?" allows None; a "part" is a generator, an emulator, or an object
-# with a line of its own, and is updated in place. np_random of an environment is always restored.
+# Classes of one module, and their attributes, each with its type. "?" allows None; a "part" is a generator, an emulator, or an
+# object with a line of its own, and is updated in place. np_random of an environment is always restored.
 TABLE = """
 stable_baselines3.common.monitor.Monitor rewards:list needs_reset:bool episode_returns:list episode_lengths:list \
     episode_times:list total_steps:int t_start:real
-stable_baselines3.common.atari_wrappers.NoopResetEnv
-stable_baselines3.common.atari_wrappers.FireResetEnv
-stable_baselines3.common.atari_wrappers.ClipRewardEnv
-stable_baselines3.common.atari_wrappers.WarpFrame
-stable_baselines3.common.atari_wrappers.AtariWrapper
+stable_baselines3.common.atari_wrappers.NoopResetEnv,FireResetEnv,ClipRewardEnv,WarpFrame,AtariWrapper
 stable_baselines3.common.atari_wrappers.StickyActionEnv _sticky_action:int
 stable_baselines3.common.atari_wrappers.EpisodicLifeEnv lives:int was_real_done:bool
 stable_baselines3.common.atari_wrappers.MaxAndSkipEnv _obs_buffer:array
@@ -35,20 +30,15 @@ stable_baselines3.common.vec_env.vec_monitor.VecMonitor episode_count:int t_star
 stable_baselines3.common.vec_env.vec_transpose.VecTransposeImage
 stable_baselines3.common.vec_env.vec_check_nan.VecCheckNan
 stable_baselines3.common.vec_env.vec_extract_dict_obs.VecExtractDictObs
-gymnasium.wrappers.common.PassiveEnvChecker
-gymnasium.wrappers.common.OrderEnforcing
+gymnasium.wrappers.common.PassiveEnvChecker,OrderEnforcing
 gymnasium.wrappers.common.TimeLimit _elapsed_steps:int?
 gymnasium.wrappers.common.RecordEpisodeStatistics episode_count:int episode_returns:real episode_lengths:int
 gymnasium.wrappers.stateful_observation.TimeAwareObservation timesteps:int
 gymnasium.wrappers.stateful_observation.MaxAndSkipObservation _obs_buffer:array
 gymnasium.wrappers.atari_preprocessing.AtariPreprocessing lives:int game_over:bool obs_buffer:list
-gymnasium.wrappers.transform_observation.FlattenObservation
-gymnasium.wrappers.transform_observation.GrayscaleObservation
-gymnasium.wrappers.transform_observation.ResizeObservation
-gymnasium.wrappers.transform_observation.RescaleObservation
-gymnasium.wrappers.transform_observation.DtypeObservation
-gymnasium.wrappers.transform_action.ClipAction
-gymnasium.wrappers.transform_action.RescaleAction
+gymnasium.wrappers.transform_observation.FlattenObservation,GrayscaleObservation,ResizeObservation
+gymnasium.wrappers.transform_observation.RescaleObservation,DtypeObservation
+gymnasium.wrappers.transform_action.ClipAction,RescaleAction
 gymnasium.wrappers.transform_reward.ClipReward
 gymnasium.envs.classic_control.cartpole.CartPoleEnv state:array? steps_beyond_terminated:int?
 gymnasium.envs.classic_control.mountain_car.MountainCarEnv state:array/tuple
@@ -88,8 +78,9 @@ TYPES: dict[str, tuple[type, ...]] = {
     "part": (),
 }
 ATTRIBUTES = {
-    name: dict(entry.split(":") for entry in entries)
-    for name, *entries in map(str.split, TABLE.replace("\\\n", "").strip().split("\n"))
+    f"{names.rpartition('.')[0]}.{name}": dict(entry.split(":") for entry in entries)
+    for names, *entries in map(str.split, TABLE.replace("\\\n", "").strip().split("\n"))
+    for name in names.rpartition(".")[2].split(",")
 }
 
 
@@ -105,11 +96,11 @@ class ResumableWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def captured(self) -> list[Any]:
         """:return: the state of this environment"""
-        return _captured_env(self.env)
+        return _captured(_layers(self))
 
     def restore(self, state: list[Any]) -> None:
         """:param state: returned by :meth:`captured`"""
-        _restore_env(self.env, state)
+        _restore_layers(_layers(self), state)
 
 
 def capture(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
@@ -117,10 +108,10 @@ def capture(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
     :param env: environments with all their wrappers
     :return: their state as JSON, and the names of the classes whose state is not known; empty if the state is complete
     """
-    wrappers, innermost = _split(env)
-    parts: list[Any] = [[_name(wrapper), _state_of(wrapper)] for wrapper in wrappers]
+    *wrappers, innermost = _layers(env)
+    parts = _captured(wrappers)
     if isinstance(innermost, DummyVecEnv):
-        envs = [_captured_env(one) for one in innermost.envs]
+        envs = [_captured(_layers(one)) for one in innermost.envs]
     elif isinstance(innermost, SubprocVecEnv) and all(innermost.env_is_wrapped(ResumableWrapper)):
         envs = innermost.env_method("captured")
     else:
@@ -136,61 +127,49 @@ def restore(env: VecEnv, state: dict[str, Any], wrappers_only: bool) -> None:
     :param wrappers_only: whether to restore the state of the vectorised wrappers only, such as the statistics of VecNormalize
     :raises ValueError: if the environments are built differently, or a value has not the type or shape of the one it replaces
     """
-    wrappers, innermost = _split(env)
+    *wrappers, innermost = _layers(env)
     try:
         now, _ = capture(env)
-        for there, here in ((state, now), *([] if wrappers_only else zip(state["envs"], now["envs"], strict=False))):
-            _check_built(_names(there), _names(here))
-        for wrapper, (_, found) in zip(wrappers, state["wrappers"], strict=True):
-            _restore(wrapper, found)
+        _check_built([*state["wrappers"], [state["innermost"], None]], [*now["wrappers"], [now["innermost"], None]])
+        if not wrappers_only:
+            for there, here in zip(state["envs"], now["envs"], strict=False):
+                _check_built(there, here)
+        _restore_layers(wrappers, state["wrappers"])
         if wrappers_only:
             return
         if len(state["envs"]) != innermost.num_envs:
             raise ValueError(f"n_envs must be {len(state['envs'])}, as in the original run, got {innermost.num_envs}.")
         for i, found in enumerate(state["envs"]):
             if isinstance(innermost, DummyVecEnv):
-                _restore_env(innermost.envs[i], found)
+                _restore_layers(_layers(innermost.envs[i]), found)
             else:
                 innermost.env_method("restore", found, indices=i)
     except (KeyError, TypeError, AttributeError, OverflowError, RuntimeError, SystemError, EOFError) as error:
         raise ValueError(f"The environment's state must be one written by a checkpoint, got {error!r}.") from error
 
 
-def _split(env: VecEnv) -> tuple[list[VecEnvWrapper], VecEnv]:
-    wrappers = []
-    while isinstance(env, VecEnvWrapper):
-        wrappers.append(env)
-        env = env.venv
-    return wrappers, env
+def _layers(env: Any) -> list[Any]:
+    """The wrappers of an environment, or of vectorised ones, from the outside, and what is innermost."""
+    layers = [env]
+    while isinstance(layers[-1], (VecEnvWrapper, gym.Wrapper)):
+        layers.append(layers[-1].venv if isinstance(layers[-1], VecEnvWrapper) else layers[-1].env)
+    return [layer for layer in layers if not isinstance(layer, ResumableWrapper)]
 
 
-def _layers(env: gym.Env) -> Iterator[gym.Env]:
-    """An environment's wrappers from the outside, and the environment itself."""
-    yield env
-    while isinstance(env, gym.Wrapper):
-        env = env.env
-        yield env
+def _captured(layers: list[Any]) -> list[Any]:
+    return [[_name(layer), _state_of(layer)] for layer in layers]
 
 
-def _captured_env(env: gym.Env) -> list[Any]:
-    return [[_name(layer), _state_of(layer)] for layer in _layers(env) if not isinstance(layer, ResumableWrapper)]
-
-
-def _restore_env(env: gym.Env, state: list[Any]) -> None:
-    layers = [layer for layer in _layers(env) if not isinstance(layer, ResumableWrapper)]
+def _restore_layers(layers: list[Any], state: list[Any]) -> None:
     for layer, (_, found) in zip(layers, state, strict=True):
         _restore(layer, found)
 
 
-def _names(state: Any) -> list[str]:
-    """The classes in a state, of all vectorised wrappers or of one environment, from the outside."""
-    parts = [*state["wrappers"], [state["innermost"], None]] if isinstance(state, dict) else state
-    return [name for name, _ in parts]
-
-
-def _check_built(expected: list[str], found: list[str]) -> None:
-    if expected != found:
-        first, other = (" in ".join(name.rpartition(".")[2] for name in names) for names in (expected, found))
+def _check_built(expected: list[Any], found: list[Any]) -> None:
+    """Compare the classes of captured layers."""
+    theirs, ours = ([name for name, _ in layers] for layers in (expected, found))
+    if theirs != ours:
+        first, other = (" in ".join(name.rpartition(".")[2] for name in names) for names in (theirs, ours))
         raise ValueError(
             f"env must be {first}, got {other}: the environment is not built as in the original run. "
             "Pass one with the same wrappers, including VecNormalize."
@@ -208,10 +187,23 @@ def _row(part: Any) -> dict[str, str] | None:
     return {**row, "np_random": "part"} if row is not None and is_env else row
 
 
+def _is_emulator(part: Any) -> bool:
+    return type(part).__module__.startswith("ale_py") and type(part).__name__ == "ALEInterface"
+
+
 def _state_of(part: Any) -> Any:
-    """The state of one wrapper, environment or part of it as JSON; ``None`` if it is not known."""
+    """The state of a wrapper, an environment or a part of it as JSON; ``None`` if it is not known."""
+    if isinstance(part, np.random.Generator):
+        return encode(part.bit_generator.state)
+    if isinstance(part, np.random.RandomState):
+        return encode(part.get_state(legacy=False))
+    if _is_emulator(part):
+        return part.cloneSystemState().serialize().hex()
+    if isinstance(part, dict):
+        return {key: _state_of(item) for key, item in part.items()}
     if (row := _row(part)) is not None:
-        return {name: _value_of(getattr(part, name), kind) for name, kind in row.items() if hasattr(part, name)}
+        values = {name: getattr(part, name) for name in row if hasattr(part, name)}
+        return {name: _state_of(value) if row[name] == "part" else encode(value) for name, value in values.items()}
     if callable(getattr(part, "state_dict", None)) and callable(getattr(part, "load_state_dict", None)):
         state = encode(part.state_dict())
         if without_pickles(state) != state:
@@ -220,38 +212,8 @@ def _state_of(part: Any) -> Any:
     return None
 
 
-def _value_of(value: Any, kind: str) -> Any:
-    if kind != "part":
-        return encode(value)
-    if isinstance(value, np.random.Generator):
-        return encode(value.bit_generator.state)
-    if isinstance(value, np.random.RandomState):
-        return encode(value.get_state(legacy=False))
-    if type(value).__name__ == "ALEInterface":
-        return value.cloneSystemState().serialize().hex()
-    if isinstance(value, dict):
-        return {key: _value_of(item, "part") for key, item in value.items()}
-    return _state_of(value)
-
-
 def _restore(part: Any, state: Any) -> None:
-    """Restore what :func:`_state_of` returned."""
-    row = _row(part)
-    if row is None:
-        part.load_state_dict(decode(state))
-        return
-    if set(state) - set(row):
-        raise ValueError(f"{_name(part)} must be restored from {sorted(row)}, got {sorted(set(state) - set(row))}.")
-    for name, value in state.items():
-        current = getattr(part, name)
-        if row[name] == "part":
-            _restore_part(current, value)
-        else:
-            setattr(part, name, _checked(f"{_name(part)}.{name}", decode(value), row[name], current))
-
-
-def _restore_part(part: Any, state: Any) -> None:
-    """Update an object in place. What is done with the state depends on the object alone, never on the file."""
+    """Restore a state in place. What is done with it depends on the object alone, never on the file."""
     if isinstance(part, np.random.Generator):
         part.bit_generator.state = decode(state)
     elif isinstance(part, np.random.RandomState):
@@ -259,13 +221,25 @@ def _restore_part(part: Any, state: Any) -> None:
         if not 0 <= found["state"]["pos"] <= 624:  # NumPy does not check it, and reads beyond its array
             raise ValueError(f"pos of a generator must be in 0 to 624, got {found['state']['pos']}.")
         part.set_state(found)
-    elif type(part).__module__.startswith("ale_py") and type(part).__name__ == "ALEInterface":
+    elif _is_emulator(part):
         part.restoreSystemState(type(part.cloneSystemState())(bytes.fromhex(state)))
     elif isinstance(part, dict):
         for key in part:
-            _restore_part(part[key], state[key])
+            _restore(part[key], state[key])
+    elif (row := _row(part)) is None:
+        part.load_state_dict(decode(state))
     else:
-        _restore(part, state)
+        _restore_attributes(part, state, row)
+
+
+def _restore_attributes(part: Any, state: dict[str, Any], row: dict[str, str]) -> None:
+    if unknown := set(state) - set(row):
+        raise ValueError(f"{_name(part)} must be restored from {sorted(row)}, got {sorted(unknown)}.")
+    for name, value in state.items():
+        if row[name] == "part":
+            _restore(getattr(part, name), value)
+        else:
+            setattr(part, name, _checked(f"{_name(part)}.{name}", decode(value), row[name], getattr(part, name)))
 
 
 def _checked(path: str, value: Any, kinds: str, current: Any) -> Any:

@@ -36,8 +36,7 @@ def atomic_write(path: str | pathlib.Path, suffix: str) -> Iterator[BinaryIO]:
     :param suffix: file extension without the dot
     """
     path = pathlib.Path(path)
-    if path.suffix == "":
-        path = path.with_suffix(f".{suffix}")
+    path = path if path.suffix else path.with_suffix(f".{suffix}")
     path = pathlib.Path(os.path.realpath(path))  # as open does, write where a link leads
     path.parent.mkdir(parents=True, exist_ok=True)
     with _partial(path, is_folder=False) as partial:
@@ -67,11 +66,7 @@ def checksum(file: BinaryIO, size: int) -> str:
 
 
 def seal(file: BinaryIO) -> None:
-    """
-    Append the checksum of all bytes to a zip file as its comment, because the checksums of the format do not cover headers.
-
-    :param file: open for reading and writing
-    """
+    """Append its checksum to a zip file, open for reading and writing, as its comment: those of the format omit headers."""
     end = file.seek(-2, os.SEEK_END) + 2  # the last two bytes hold the length of the comment
     file.write(struct.pack("<H", len(SEAL) + 64))
     file.write(SEAL + checksum(file, end).encode())
@@ -88,11 +83,7 @@ def is_unbroken(file: BinaryIO) -> bool:
 
 
 def stored_members(archive: zipfile.ZipFile) -> list[str]:
-    """
-    The names of the members of a zip file that SB3 or this package writes, which are never compressed.
-
-    :raises ValueError: if they would take more memory than the file has bytes
-    """
+    """The names of a zip file's members; raises ValueError if they would take more memory than the file has bytes."""
     infos = archive.infolist()
     if any(info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size for info in infos):
         raise ValueError("its members are compressed, which files of this package never are")
@@ -141,36 +132,23 @@ def _partial(path: pathlib.Path, is_folder: bool) -> Iterator[pathlib.Path]:
                 break
             os.close(descriptor)
     try:
-        with _full_disk_named(path):
-            yield partial
-    finally:
-        _remove(partial)
-        if descriptor is not None:
-            os.close(descriptor)  # and the lock with it
-
-
-@contextmanager
-def _full_disk_named(path: pathlib.Path) -> Iterator[None]:
-    """Convert any error caused by a full disk, including PyTorch's, into an OSError that states what is left of ``path``."""
-    try:
-        yield
+        yield partial
     except Exception as error:
-        cause: BaseException | None = error
+        cause: BaseException | None = error  # any error caused by a full disk, including PyTorch's, shall say so
         while cause is not None and getattr(cause, "errno", None) != errno.ENOSPC:
             cause = cause.__context__
         if cause is None:
             raise
         state = "is unchanged" if path.exists() else "was not written"
         raise OSError(errno.ENOSPC, f"No space left on the disk of {path.parent}: {path.name} {state}") from error
+    finally:
+        _remove(partial)
+        if descriptor is not None:
+            os.close(descriptor)  # and the lock with it
 
 
 def remove_leftovers(folder: pathlib.Path, names: str) -> None:
-    """
-    Remove leftovers of killed processes from a folder; files being written are locked and kept.
-
-    :param folder: folder to clean
-    :param names: glob pattern for the names of the files or folders that they wrote
-    """
+    """Remove leftovers of killed processes, which wrote files or folders of these names (a pattern); others are locked."""
     if fcntl is None:
         return
     for leftover in folder.glob(f".{names}.*.partial"):

@@ -8,27 +8,21 @@ import pickle
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import recursive_getattr, save_to_zip_file
+from stable_baselines3.common.save_util import load_from_pkl, recursive_getattr, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_eqr.common.checks.validation import check_names
 from sb3_eqr.common.saving.buffers import read_buffer, write_buffer
-from sb3_eqr.common.saving.checkpoints import (
-    BUFFER,
-    MODEL,
-    read_manifest,
-    restore_environment,
-    restore_generators,
-    warn_of_unknown,
-)
+from sb3_eqr.common.saving.checkpoints import BUFFER, MODEL, read_manifest, restore_run
 from sb3_eqr.common.saving.files import atomic_write, is_unbroken, seal, stored_members
 from sb3_eqr.common.saving.plain_data import UntrustedError, decode, encode
 from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
@@ -36,26 +30,37 @@ from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
 LARGEST_DATA = 100 << 20  # bytes of a model's attributes
 MEMORY_PER_BYTE = 8  # of a file: both target copies, and what their initialisation needs
 
-SelfSafeFiles = TypeVar("SelfSafeFiles", bound="SafeFiles")
+FileOrPath = str | pathlib.Path | io.BufferedIOBase
 
 
-def locate(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
-    """
-    :param path: a file, whose extension may be left out
-    :param suffix: that extension, without the dot
-    :return: the existing file; ``path`` if there is none, so that opening it raises
-    :raises ValueError: if there is a folder, or something that is not a regular file
-    """
+@contextmanager
+def _reading(path: FileOrPath, suffix: str) -> Iterator[Any]:
+    """A file-like object itself, or an open file, whose extension may be left out."""
+    if not isinstance(path, (str, pathlib.Path)):
+        yield path
+        return
     place = pathlib.Path(path)
     found = next((one for one in (place, place.parent / f"{place.name}.{suffix}") if one.is_file()), None)
     if found is None and place.is_dir():
         raise ValueError(f"{path} must be a file, got a folder. Use resume for a folder of checkpoints.")
     if found is None and place.exists():
         raise ValueError(f"{path} must be a regular file, got a pipe or a device.")
-    return found or place
+    with open(found or place, "rb") as file:
+        yield file
 
 
-def read_model(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
+@contextmanager
+def _writing(path: FileOrPath, suffix: str) -> Iterator[Any]:
+    """A file-like object itself, or a file that appears under its name once it is complete and sealed."""
+    if not isinstance(path, (str, pathlib.Path)):
+        yield path
+        return
+    with atomic_write(path, suffix) as file:
+        yield file
+        seal(file)
+
+
+def read_model(path: FileOrPath) -> bytes:
     """
     Read a model's file once, so that what is checked is what is loaded. The components of a model are zip files themselves,
     so a truncated file may still look like a zip file.
@@ -64,12 +69,10 @@ def read_model(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
     :return: its content, an unchanged zip file with everything that SB3's ``save`` writes, none of it compressed
     :raises ValueError: if it is anything else
     """
-    if isinstance(path, (str, pathlib.Path)):
-        content = locate(path, "zip").read_bytes()
-    else:
-        place = path.tell()
-        content = path.read()
-        path.seek(place)
+    with _reading(path, "zip") as file:
+        place = file.tell()
+        content = file.read()
+        file.seek(place)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = stored_members(archive)
@@ -98,10 +101,7 @@ def data_of(content: bytes) -> dict[str, Any]:
 
 
 class LimitedMemory(TorchDispatchMode):
-    """
-    Raises ValueError when new tensors would take more than ``n_bytes``: a file holds all parameters of the agent that it
-    describes, so it cannot be much smaller.
-    """
+    """Raises ValueError when new tensors take more than ``n_bytes``: a file holds the parameters of the agent it describes."""
 
     def __init__(self, n_bytes: int):
         super().__init__()
@@ -117,16 +117,8 @@ class LimitedMemory(TorchDispatchMode):
         return found
 
 
-def decode_data(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
-    """
-    Decode attributes from JSON.
-
-    :param path: path for error messages
-    :param data: the JSON of each attribute, by name
-    :param trust: whether to load pickled attributes
-    :return: the attributes by name
-    :raises ValueError: if an attribute is pickled and ``trust`` is ``False``
-    """
+def _decoded(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
+    """Decode the attributes of a model; a ValueError names all that are pickled if ``trust`` is ``False``."""
     found, refused = {}, {}
     for name, value in data.items():
         try:
@@ -149,12 +141,7 @@ class SafeFiles(OffPolicyAlgorithm):
         """For ``pickle`` and ``copy``: replace the logger, which holds open files, by one without output until ``learn``."""
         return {**self.__dict__, "_logger": Logger(None, []), "_custom_logger": False}
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
+    def save(self, path: FileOrPath, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """
         As SB3's ``save``, with the state of the random generators; the file is written under a temporary name and renamed.
         Attributes are saved as plain data (:mod:`~sb3_eqr.common.saving.plain_data`), except that custom classes in
@@ -167,12 +154,8 @@ class SafeFiles(OffPolicyAlgorithm):
         excluded |= {name.split(".")[0] for name in [*names, *variable_names]}
         data = {name: encode(value) for name, value in vars(self).items() if name not in excluded}
         variables = {name: recursive_getattr(self, name) for name in variable_names}
-        if not isinstance(path, (str, pathlib.Path)):
-            save_to_zip_file(path, data, self.get_parameters(), variables)
-            return
-        with atomic_write(path, "zip") as file:
-            save_to_zip_file(file, data, self.get_parameters(), variables)  # type: ignore[arg-type]
-            seal(file)
+        with _writing(path, "zip") as file:
+            save_to_zip_file(file, data, self.get_parameters(), variables)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # created by _setup_model
@@ -186,8 +169,8 @@ class SafeFiles(OffPolicyAlgorithm):
 
     @classmethod
     def load(
-        cls: type[SelfSafeFiles],
-        path: str | pathlib.Path | io.BufferedIOBase,
+        cls,
+        path: FileOrPath,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
@@ -195,7 +178,7 @@ class SafeFiles(OffPolicyAlgorithm):
         force_reset: bool = True,
         trust: bool = False,
         **kwargs: Any,
-    ) -> SelfSafeFiles:
+    ) -> Self:
         """
         As SB3's ``load``, with the same parameters, and ``trust``. If the model has a seed (and no other is given), the random
         generators are restored, so a run that was saved after ``learn``, or between two rollouts, can be resumed exactly (pass
@@ -206,11 +189,8 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: if a keyword is not an argument of the agent
         """
-        check_names(
-            f"{cls.__name__}.load",
-            kwargs,
-            [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:],
-        )
+        legal = [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:]
+        check_names(f"{cls.__name__}.load", kwargs, legal)
         content = read_model(path)
         given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
         data = {name: value for name, value in data_of(content).items() if name not in given}
@@ -221,30 +201,17 @@ class SafeFiles(OffPolicyAlgorithm):
                 f"{path} must be a file written by {cls.__name__}.save, got an agent with a policy of {module}. "
                 "Load it with the class that saved it."
             )
-        objects = {**decode_data(path, data, trust), **given}  # instead of SB3's unpickling
+        objects = {**_decoded(path, data, trust), **given}  # instead of SB3's unpickling
         with LimitedMemory(MEMORY_PER_BYTE * len(content) + LARGEST_DATA):
-            model = super().load(
-                io.BytesIO(content),  # type: ignore[arg-type]
-                env,
-                device,
-                objects,
-                print_system_info,
-                force_reset,
-                **kwargs,
-            )
-        reseeded = "seed" in kwargs or "seed" in (custom_objects or {})
-        if model.seed is not None and not reseeded and getattr(model, "rng_state", None) is not None:
+            file: Any = io.BytesIO(content)
+            model = super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
+        is_reseeded = "seed" in kwargs or "seed" in given
+        if model.seed is not None and not is_reseeded and getattr(model, "rng_state", None) is not None:
             set_rng_state(model.rng_state, model.action_space)
         return model
 
     @classmethod
-    def resume(
-        cls: type[SelfSafeFiles],
-        path: str | pathlib.Path,
-        env: GymEnv,
-        device: th.device | str = "auto",
-        trust: bool = False,
-    ) -> SelfSafeFiles:
+    def resume(cls, path: str | pathlib.Path, env: GymEnv, device: th.device | str = "auto", trust: bool = False) -> Self:
         """
         Resume from a checkpoint of :class:`~sb3_eqr.common.saving.checkpoints.ExactCheckpointCallback`, bit for bit as if
         the run had not stopped. Then call ``model.learn(total_timesteps - model.num_timesteps, reset_num_timesteps=False)``.
@@ -253,7 +220,6 @@ class SafeFiles(OffPolicyAlgorithm):
         :param env: environment built as in the original run, including VecNormalize
         :param device: as in ``load``
         :param trust: as in ``load``
-        :return: the agent
         :raises ValueError: if there is no complete checkpoint, or one of its files has changed
         """
         if env is None:
@@ -263,26 +229,23 @@ class SafeFiles(OffPolicyAlgorithm):
         model = cls.load(checkpoint / MODEL, env, device, force_reset=not is_exact, trust=trust)
         if (checkpoint / BUFFER).is_file():
             model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
-        restore_environment(model, manifest, is_exact)
+        restore_run(model, manifest, is_exact)
         if not is_exact:
-            warn_of_unknown(checkpoint, manifest)
-        restore_generators(model, manifest)
+            warnings.warn(
+                f"{checkpoint}: the state of {', '.join(manifest['unknown'][:3])} is not known, so training resumes with new "
+                "episodes, and does not continue bit for bit. Give the class state_dict and load_state_dict; in other "
+                "processes, make the environments with wrapper_class=sb3_eqr.envs.ResumableWrapper."
+            )
         return model
 
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+    def save_replay_buffer(self, path: FileOrPath) -> None:
         """As SB3's ``save_replay_buffer``, but writes arrays and plain data, under a temporary name that is then renamed."""
         assert self.replay_buffer is not None
         notes = {"algorithm": type(self).__name__, "num_timesteps": self.num_timesteps}
-        if not isinstance(path, (str, pathlib.Path)):
-            write_buffer(path, self.replay_buffer, notes)  # type: ignore[arg-type]
-            return
-        with atomic_write(path, "pkl") as file:  # SB3's extension, which scripts expect
+        with _writing(path, "pkl") as file:  # SB3's extension, which scripts expect
             write_buffer(file, self.replay_buffer, notes)
-            seal(file)
 
-    def load_replay_buffer(
-        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, trust: bool = False
-    ) -> None:
+    def load_replay_buffer(self, path: FileOrPath, truncate_last_traj: bool = True, trust: bool = False) -> None:
         """
         As SB3's ``load_replay_buffer``; ``truncate_last_traj`` has no effect here.
 
@@ -315,32 +278,28 @@ class SafeFiles(OffPolicyAlgorithm):
                 setattr(loaded, name, getattr(before, name))
         self.replay_buffer = loaded
 
-    def _read_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool) -> tuple[Any, dict[str, Any]]:
-        before = self.replay_buffer
-        file = open(locate(path, "pkl"), "rb") if isinstance(path, (str, pathlib.Path)) else path
-        try:
-            is_ours = zipfile.is_zipfile(file)
-            if is_ours and not is_unbroken(file):  # type: ignore[arg-type]
-                raise ValueError("it has changed since it was saved")
-            file.seek(0)
-            if is_ours:
-                return read_buffer(file, before)  # type: ignore[arg-type]
-            if not trust:
+    def _read_replay_buffer(self, path: FileOrPath, trust: bool) -> tuple[Any, dict[str, Any]]:
+        with _reading(path, "pkl") as file:
+            try:
+                is_ours = zipfile.is_zipfile(file)
+                if is_ours and not is_unbroken(file):
+                    raise ValueError("it has changed since it was saved")
+                file.seek(0)
+                if is_ours:
+                    return read_buffer(file, self.replay_buffer)
+                if not trust:
+                    raise ValueError(
+                        "it is truncated, or a pickle, and loading a pickle runs the code that it names: "
+                        "pass trust=True if you trust the file"
+                    )
+                found = load_from_pkl(file)
+                assert isinstance(found, ReplayBuffer), "The replay buffer must inherit from ReplayBuffer class"
+                return found, {}
+            except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:
                 raise ValueError(
-                    "it is truncated, or a pickle, and loading a pickle runs the code that it names: "
-                    "pass trust=True if you trust the file"
-                )
-            super().load_replay_buffer(file)  # type: ignore[arg-type]
-            return self.replay_buffer, {}
-        except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:
-            raise ValueError(
-                f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
-                f"got something else ({error}). Load an earlier one."
-            ) from error
-        finally:
-            self.replay_buffer = before
-            if isinstance(path, (str, pathlib.Path)):
-                file.close()
+                    f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
+                    f"got something else ({error}). Load an earlier one."
+                ) from error
 
 
 def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:

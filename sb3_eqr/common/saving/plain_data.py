@@ -46,53 +46,35 @@ class UntrustedError(ValueError):
 
 def encode(value: Any) -> Any:
     """Convert a value to JSON; values of types that this module does not list are embedded as pickles."""
-    if value is None or type(value) in (bool, int, float, str):
+    kind: Any = type(value)
+    if value is None or kind in (bool, int, float, str):
         return value
-    for encoder in (_encode_container, _encode_array, _encode_space, _encode_known):
-        found = encoder(value)
-        if found is not None:
-            return found
-    kind = value if isinstance(value, (type, FunctionType)) else type(value)
+    if kind in ENCODERS:
+        return ENCODERS[kind](value)
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biufcSUMm":
+        data = base64.b64encode(value.tobytes()).decode()
+        array = "scalar" if value.ndim == 0 else "array"
+        return {KIND: array, "dtype": value.dtype.str, "shape": list(value.shape), "data": data}
+    if kind.__name__ in SPACES and kind is getattr(spaces, kind.__name__):
+        return _encode_space(value)
+    if isinstance(value, (type, FunctionType)):
+        kind = value
+        if _is_legal(value):
+            return {KIND: "class", "module": value.__module__, "name": value.__qualname__}
+    elif kind.__name__ in OBJECTS.get(kind.__module__, ()):
+        return _encode_object(value)
     name = f"{kind.__module__}.{kind.__qualname__}"
     return {KIND: "pickle", "type": name, "pickle": base64.b64encode(cloudpickle.dumps(value)).decode()}
 
 
-def _encode_container(value: Any) -> Any:
-    if type(value) is list:
-        return [encode(item) for item in value]
-    if type(value) in (dict, OrderedDict):
-        if all(isinstance(key, str) for key in value) and KIND not in value:
-            return {key: encode(item) for key, item in value.items()}
-        return {KIND: "dict", "items": [[encode(key), encode(item)] for key, item in value.items()]}
-    if type(value) is tuple:
-        return {KIND: "tuple", "items": [encode(item) for item in value]}
-    if type(value) is deque:
-        return {KIND: "deque", "items": [encode(item) for item in value], "maxlen": value.maxlen}
-    return None
-
-
-def _encode_array(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biufcSUMm":
-        data = base64.b64encode(value.tobytes()).decode()
-        return {
-            KIND: "scalar" if value.ndim == 0 else "array",
-            "dtype": value.dtype.str,
-            "shape": list(value.shape),
-            "data": data,
-        }
-    if isinstance(value, th.dtype):
-        return {KIND: "dtype", "name": str(value).removeprefix("torch.")}
-    if isinstance(value, th.device):
-        return {KIND: "device", "name": str(value)}
-    if type(value) is th.Tensor:
-        return {KIND: "tensor", "array": encode(value.detach().cpu().numpy())}
-    return None
+def _encode_dict(value: dict[Any, Any]) -> Any:
+    if all(isinstance(key, str) for key in value) and KIND not in value:
+        return {key: encode(item) for key, item in value.items()}
+    return {KIND: "dict", "items": [[encode(key), encode(item)] for key, item in value.items()]}
 
 
 def _encode_space(space: Any) -> Any:
     name = type(space).__name__
-    if name not in SPACES or type(space) is not getattr(spaces, name):
-        return None
     arguments = {key: getattr(space, key) for key in SPACES[name]}
     if name == "Dict":
         arguments["spaces"] = dict(arguments["spaces"])
@@ -103,19 +85,25 @@ def _encode_space(space: Any) -> Any:
     return {KIND: "space", "name": name, "arguments": encode(arguments)}
 
 
-def _encode_known(value: Any) -> Any:
-    if isinstance(value, (type, FunctionType)):
-        name = {"module": value.__module__, "name": value.__qualname__}
-        return {KIND: "class", **name} if _is_legal(value) else None
-    kind = type(value)
-    if kind.__name__ not in OBJECTS.get(kind.__module__, ()):
-        return None
-    name = {"module": kind.__module__, "name": kind.__name__}
+def _encode_object(value: Any) -> Any:
+    name = {"module": type(value).__module__, "name": type(value).__name__}
     if isinstance(value, enum.Enum):
         return {KIND: "enum", **name, "value": encode(value.value)}
     if isinstance(value, tuple):
-        return {KIND: "named tuple", **name, "items": [encode(item) for item in value]}
+        return {KIND: "named tuple", **name, "items": encode(list(value))}
     return {KIND: "object", **name, "attributes": {key: encode(item) for key, item in vars(value).items()}}
+
+
+ENCODERS: dict[type, Callable[[Any], Any]] = {
+    list: lambda value: [encode(item) for item in value],
+    dict: _encode_dict,
+    OrderedDict: _encode_dict,
+    tuple: lambda value: {KIND: "tuple", "items": encode(list(value))},
+    deque: lambda value: {KIND: "deque", "items": encode(list(value)), "maxlen": value.maxlen},
+    th.dtype: lambda value: {KIND: "dtype", "name": str(value).removeprefix("torch.")},
+    th.device: lambda value: {KIND: "device", "name": str(value)},
+    th.Tensor: lambda value: {KIND: "tensor", "array": encode(value.detach().cpu().numpy())},
+}
 
 
 def without_pickles(value: Any) -> Any:
@@ -142,93 +130,83 @@ def decode(value: Any, trust: bool = False) -> Any:
     if not isinstance(value, Mapping):
         return value
     if ":serialized:" in value:  # SB3's own format
-        return _decode_pickle({"pickle": value[":serialized:"], "type": value.get(":type:")}, trust)
-    if KIND not in value:
-        return {key: decode(item, trust) for key, item in value.items()}
-    if value[KIND] not in DECODERS:
+        value = {KIND: "pickle", "pickle": value[":serialized:"], "type": value.get(":type:")}
+    if KIND in value and value[KIND] not in DECODERS:
         raise ValueError(f"data must be written by save(), got {KIND} {value[KIND]!r}.")
-    return DECODERS[value[KIND]](value, trust)
+    if value.get(KIND) == "pickle" and not trust:
+        raise UntrustedError(f"a pickle of {value.get('type')}")
+    parts = {key: decode(item, trust) for key, item in value.items()}
+    return DECODERS[value[KIND]](parts) if KIND in value else parts
 
 
-def _decode_array(value: Mapping[str, Any], trust: bool) -> Any:
-    content = bytearray(base64.b64decode(value["data"]))  # writeable; and no larger than the file, whatever it declares
-    array = np.frombuffer(content, np.dtype(str(value["dtype"]))).reshape(value["shape"])
-    return array[()] if value[KIND] == "scalar" else array
+def _decode_array(parts: dict[str, Any]) -> Any:
+    content = bytearray(base64.b64decode(parts["data"]))  # writeable; and no larger than the file, whatever it declares
+    array = np.frombuffer(content, np.dtype(str(parts["dtype"]))).reshape(parts["shape"])
+    return array[()] if parts[KIND] == "scalar" else array
 
 
-def _decode_dtype(value: Mapping[str, Any], trust: bool) -> th.dtype:
-    found = getattr(th, value["name"])
+def _decode_dtype(parts: dict[str, Any]) -> th.dtype:
+    found = getattr(th, parts["name"])
     if not isinstance(found, th.dtype):
-        raise ValueError(f"data must name a dtype of torch, got {value['name']!r}.")
+        raise ValueError(f"data must name a dtype of torch, got {parts['name']!r}.")
     return found
 
 
-def _decode_space(value: Mapping[str, Any], trust: bool) -> spaces.Space:
-    if value["name"] not in SPACES:
-        raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {value['name']!r}.")
-    arguments = decode(value["arguments"], trust)
-    if value["name"] == "Dict":  # which sorts the keys of a plain dict, but features extractors concatenate in their order
+def _decode_space(parts: dict[str, Any]) -> spaces.Space:
+    name, arguments = parts["name"], parts["arguments"]
+    if name not in SPACES:
+        raise ValueError(f"data must name one of the spaces {list(SPACES)}, got {name!r}.")
+    if name == "Dict":  # which sorts the keys of a plain dict, but features extractors concatenate in their order
         arguments["spaces"] = OrderedDict(arguments["spaces"])
-    return getattr(spaces, value["name"])(**arguments)
+    return getattr(spaces, name)(**arguments)
 
 
-def _decode_class(value: Mapping[str, Any], trust: bool) -> Any:
-    found = _find(value["module"], value["name"])
+def _decode_class(parts: dict[str, Any]) -> Any:
+    found = _find(parts["module"], parts["name"])
     if not _is_legal(found):
-        raise ValueError(f"data must name a class that agents use, got {value['module']}.{value['name']}.")
+        raise ValueError(f"data must name a class that agents use, got {parts['module']}.{parts['name']}.")
     return found
 
 
-def _decode_object(value: Mapping[str, Any], trust: bool) -> Any:
-    if value["name"] not in OBJECTS.get(value["module"], ()):
-        raise ValueError(f"data must be objects of {sorted(OBJECTS)}, got {value['module']}.{value['name']}.")
-    found: Any = _find(value["module"], value["name"])
-    if value[KIND] == "enum":
-        return found(decode(value["value"], trust))
-    if value[KIND] == "named tuple":
-        return found(*[decode(item, trust) for item in value["items"]])
-    attributes = decode(value["attributes"], trust)
-    made = object.__new__(found)
-    vars(made).update(attributes)
-    check = getattr(found, "__post_init__", None)
-    if check is not None:
-        check(made)
+def _decode_object(parts: dict[str, Any]) -> Any:
+    if parts["name"] not in OBJECTS.get(parts["module"], ()):
+        raise ValueError(f"data must be objects of {sorted(OBJECTS)}, got {parts['module']}.{parts['name']}.")
+    kind = _find(parts["module"], parts["name"])
+    if parts[KIND] == "enum":
+        return kind(parts["value"])
+    if parts[KIND] == "named tuple":
+        return kind(*parts["items"])
+    made = object.__new__(kind)
+    vars(made).update(parts["attributes"])
+    if hasattr(kind, "__post_init__"):
+        kind.__post_init__(made)  # the check of the class: a file may have an attribute of this name
     return made
 
 
-def _decode_pickle(value: Mapping[str, Any], trust: bool) -> Any:
-    if not trust:
-        raise UntrustedError(f"a pickle of {value.get('type')}")
-    return cloudpickle.loads(base64.b64decode(value["pickle"]))
-
-
-DECODERS: dict[str, Callable[[Mapping[str, Any], bool], Any]] = {
-    "dict": lambda value, trust: {decode(key, trust): decode(item, trust) for key, item in value["items"]},
-    "tuple": lambda value, trust: tuple(decode(value["items"], trust)),
-    "deque": lambda value, trust: deque(decode(value["items"], trust), value["maxlen"]),
+DECODERS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "dict": lambda parts: dict(parts["items"]),
+    "tuple": lambda parts: tuple(parts["items"]),
+    "deque": lambda parts: deque(parts["items"], parts["maxlen"]),
     "array": _decode_array,
     "scalar": _decode_array,
     "dtype": _decode_dtype,
-    "device": lambda value, trust: th.device(value["name"]),
-    "tensor": lambda value, trust: th.from_numpy(np.ascontiguousarray(decode(value["array"], trust))),
+    "device": lambda parts: th.device(parts["name"]),
+    "tensor": lambda parts: th.from_numpy(np.ascontiguousarray(parts["array"])),
     "space": _decode_space,
     "class": _decode_class,
-    "object": _decode_object,
-    "named tuple": _decode_object,
-    "enum": _decode_object,
-    "pickle": _decode_pickle,
+    **dict.fromkeys(("object", "named tuple", "enum"), _decode_object),
+    "pickle": lambda parts: cloudpickle.loads(base64.b64decode(parts["pickle"])),
 }
 
 
 def _find(module: str, name: str) -> Any:
+    """The object of this name, or ``None`` if there is none in a module that is imported or that a file may import."""
     if module.split(".")[0] not in PACKAGES and module not in OBJECTS:
         raise ValueError(f"data must name classes of {', '.join(PACKAGES)}, got {module}.{name}.")
     may_import = module in OBJECTS or module.startswith(DEFINING)
     found: Any = importlib.import_module(module) if may_import else sys.modules.get(module)
-    if found is None:
-        raise ValueError(f"data must name a class that agents use, got {module}.{name}.")
     for part in name.split("."):
-        found = getattr(found, part)
+        found = getattr(found, part, None)
     return found
 
 

@@ -1,7 +1,6 @@
 """Transfer of representations: tasks that differ only in rewards share the symmetries of their transitions (paper, §4)."""
 
 import io
-import pathlib
 import re
 from typing import Any
 
@@ -11,13 +10,13 @@ from torch import nn
 
 from sb3_eqr.common.checks.validation import check_same_parameters
 from sb3_eqr.common.policies import EqRPolicy
-from sb3_eqr.common.saving.models import data_of, read_model
+from sb3_eqr.common.saving.models import FileOrPath, data_of, read_model
 
 ENCODER = "features_extractor"
 LATENT_PARTS = ("embedding", "transition", "action_symmetry", "symmetry_projection")  # κ, ρ and b; r_ψ belongs to the task
 
 
-def load_representation(policy: EqRPolicy, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+def load_representation(policy: EqRPolicy, path: FileOrPath) -> None:
     """
     Load encoder, κ, ρ and b of a saved agent into a policy and its target copy. On any mismatch, nothing is changed.
 
