@@ -17,7 +17,6 @@ class Cluster:
     """
     A Ray task per run, with the methods of :class:`~sb3_eqr.benchmark.dispatch.Processes`; Ray decides how many run at once.
 
-    :param settings: settings of all runs
     :param address: of a Ray cluster that can access the benchmark's folder, or "local" for this machine
     :param cpus: CPUs that Ray reserves for a run
     :param gpus: GPUs that Ray reserves for a run, such as 0.1 for ten runs per GPU

@@ -1,6 +1,7 @@
 """The commands ``sb3-eqr benchmark run|status|report|pack``, apart from the parser, whose help needs none of these imports."""
 
 import argparse
+import contextlib
 import os
 import pathlib
 import shlex
@@ -19,10 +20,6 @@ from sb3_eqr.envs import import_packages
 from sb3_eqr.zoo.checks import check_device, fail
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 def check_resources(args: argparse.Namespace) -> str:
     """
     :return: the device of every run
@@ -38,7 +35,7 @@ def check_resources(args: argparse.Namespace) -> str:
         ("episodes", args.episodes is None or args.episodes >= 1, ">= 1"),
     ):
         if not is_right:
-            raise ValueError(f"{_flag(name)} must be {needed}, got {getattr(args, name):g}.")
+            raise ValueError(f"--{name.replace('_', '-')} must be {needed}, got {getattr(args, name):g}.")
     if args.ray is None and args.gpus_per_run:
         raise ValueError(
             f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU."
@@ -81,7 +78,8 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
     if args.suite is None and args.agents is None:
         for name in ("suite_file", "games", "seeds", "first_seed", "steps", "episodes"):
             if getattr(args, name):
-                raise ValueError(f"{_flag(name)} needs --suite and --agents. FOLDER alone resumes the runs in it.")
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
         return with_present_defaults(read_plan(args.folder))
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")
@@ -128,11 +126,8 @@ def run(args: argparse.Namespace) -> bool:
     if not console.is_terminal:  # which shows a table that changes
         print(f"Progress: sb3-eqr benchmark status {shlex.quote(str(args.folder))}", flush=True)
     if waiting:
-        pool = make_pool(args, settings)
-        try:
+        with contextlib.closing(make_pool(args, settings)) as pool:
             failed = finish(pool, runs, waiting, settings, console)
-        finally:
-            pool.close()
     for lost in failed:
         print(f"failed: {lost.label}: {lost.folder / ERROR}")
     if failed:
@@ -162,8 +157,8 @@ def report(args: argparse.Namespace) -> None:
 
     references = {}
     for text in args.reference:
-        name, separator, path = text.partition("=")
-        if not (name and separator and path):
+        name, _, path = text.partition("=")
+        if not (name and path):
             raise ValueError(f"--reference must be NAME=FILE, got {text!r}.")
         references[name] = pathlib.Path(path)
     first = args.folders[0]

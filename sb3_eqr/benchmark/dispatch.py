@@ -34,15 +34,10 @@ class Crash(Exception):
 
 
 class Processes:
-    """
-    A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods.
-
-    :param settings: settings of all runs
-    :param slots: number of processes at once
-    """
+    """A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods."""
 
     def __init__(self, settings: Settings, slots: int):
-        self.slots = slots
+        self.slots = slots  # number of processes at once
         self._settings = settings
         self._open: dict[Any, Run] = {}
         os.environ["OMP_NUM_THREADS"] = str(settings.n_threads)  # inherited, and read by PyTorch when it is imported
@@ -65,8 +60,8 @@ class Processes:
 
     def outcome(self, handle: Any) -> str:
         """
-        :return: what the run's process returned
-        :raises Crash: if a signal killed it, or an exception ended it
+        :return: what :func:`execute` returned
+        :raises Crash: if a signal killed the process, or an exception ended it
         """
         handle.join()
         run = self._open.pop(handle)
@@ -132,10 +127,8 @@ def finish(pool: Any, runs: list[Run], waiting: list[Run], settings: Settings, c
     Execute runs: interrupted ones resume from their last checkpoint, runs that another process holds are waited for. A run
     that crashes twice has failed; the others continue. When ``settings.stop_at`` has passed, no further run starts.
 
-    :param pool: where to execute them
-    :param runs: runs of the benchmark
-    :param waiting: the runs that are not finished, in order
-    :param console: where to print the table
+    :param runs: all runs, for the table
+    :param waiting: those that are not finished, in order
     :return: the runs that failed
     """
     states = [run.state() for run in runs]

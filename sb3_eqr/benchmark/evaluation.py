@@ -104,5 +104,4 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
             scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)
         finally:
             env.close()
-    assert isinstance(scores, list) and isinstance(lengths, list)
-    return [float(score) for score in scores], [int(length) for length in lengths]
+    return np.asarray(scores, dtype=float).tolist(), np.asarray(lengths, dtype=int).tolist()

@@ -52,23 +52,19 @@ class Run:
     """
     One agent on one game with one seed, in a folder of its own.
 
-    :param suite: name of the suite
-    :param seed: seed of agent, environments and evaluation
-    :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :param entry: see :func:`~sb3_eqr.benchmark.agents.hyperparameters`
-    :param command: the command that planned the run, with its suite and agents
-    :param defaults: see :func:`~sb3_eqr.benchmark.agents.defaults`; empty for a run of a version that did not record them
+    For ``protocol``, ``entry`` and ``defaults`` see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`,
+    :func:`~sb3_eqr.benchmark.agents.hyperparameters` and :func:`~sb3_eqr.benchmark.agents.defaults`.
     """
 
     folder: pathlib.Path
     agent: Agent
-    suite: str
+    suite: str  # its name
     game: str
-    seed: int
+    seed: int  # of agent, environments and evaluation
     protocol: dict[str, Any]
     entry: dict[str, Any]
-    command: str = ""
-    defaults: dict[str, Any] = dataclasses.field(default_factory=dict)
+    command: str = ""  # that planned the run, with its suite and agents
+    defaults: dict[str, Any] = dataclasses.field(default_factory=dict)  # empty in plans of versions that did not record them
 
     @property
     def label(self) -> str:
@@ -116,18 +112,18 @@ class Run:
         """:raises ValueError: if the run has begun with other settings"""
         if not self.has_begun():
             return
-        path = self.folder / PLAN
-        old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(to_json(self.description()))
+        old = json.loads((self.folder / PLAN).read_text(encoding="utf-8"))
+        new = json.loads(to_json(self.description()))
         for what in ("protocol", "entry", "defaults"):
             if not old.get(what):
                 continue  # begun by a version that did not record the defaults
             before, now = flatten(old[what]), flatten(new[what])
             for key in sorted((before.keys() | now.keys()) - {"file"}):
-                if before.get(key) != now.get(key):
+                was, is_now = before.get(key), now.get(key)
+                if was != is_now:
                     raise ValueError(
-                        f"{self.folder}: {key} must be {before.get(key)!r}, as when the run was started, got "
-                        f"{now.get(key)!r}. Scores of different settings are not comparable: use another folder, or the same "
-                        "settings."
+                        f"{self.folder}: {key} must be {was!r}, as when the run was started, got {is_now!r}. "
+                        "Scores of different settings are not comparable: use another folder, or the same settings."
                     )
 
     def is_locked(self) -> bool:

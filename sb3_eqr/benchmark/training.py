@@ -153,7 +153,7 @@ class RunCallback(BaseCallback):
             performs like an untrained one
         """
         resets: Any = getattr(self.model, "_resets", None)
-        if resets is None or resets.schedule.interval is None or not resets.done:
+        if resets is None or not resets.done:
             return True
         return 2 * resets.updates_since(self.model._n_updates) >= resets.schedule.interval  # type: ignore[attr-defined]
 
@@ -199,13 +199,10 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
             device=settings.device,
             config=str(config),
         )
-        experiment = manager.setup_experiment()
-        assert experiment is not None
-        model = experiment[0]
-        old = model.get_env()
+        model, _ = manager.setup_experiment()  # type: ignore[misc]
+        logged = model.get_env()
         model.set_env(manager.create_envs(manager.n_envs, no_log=True))
-        if old is not None:
-            old.close()
+        logged.close()  # type: ignore[union-attr]
     return model, manager
 
 
