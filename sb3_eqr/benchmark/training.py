@@ -243,7 +243,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     return model, decode(manifest["notes"]), is_exact
 
 
-def remove_leftovers(folder: pathlib.Path) -> None:
+def clean_up(folder: pathlib.Path) -> None:
     """Remove what only an unfinished run needs, and partial files that a killed one left."""
     for checkpoint in find_checkpoints(folder):
         checkpoints.discard(checkpoint)
@@ -313,7 +313,7 @@ def train(run: Run, settings: Settings) -> str:
         save_model(model, manager, run)
     write_json(run.folder / RESULT, make_row(run, model, record))
     model.get_env().close()  # type: ignore[union-attr]
-    remove_leftovers(run.folder)
+    clean_up(run.folder)
     return "finished"
 
 
@@ -328,7 +328,7 @@ def execute(run: Run, settings: Settings) -> str:
     try:
         with FileLock(run.folder / LOCK, blocking=False):
             if (run.folder / RESULT).is_file():
-                remove_leftovers(run.folder)  # of a process that was killed after writing the result
+                clean_up(run.folder)  # of a process that was killed after writing the result
                 return "finished"
             th.set_num_threads(settings.n_threads)
             (run.folder / ERROR).unlink(missing_ok=True)  # of an earlier attempt
