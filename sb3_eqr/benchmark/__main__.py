@@ -8,17 +8,13 @@ import sys
 SEEDS = 5  # default
 
 
-def absolute(path: str) -> pathlib.Path:
-    """:return: the absolute path, which is valid on every machine of a cluster"""
-    return pathlib.Path(path).resolve()
-
-
 def make_parser() -> argparse.ArgumentParser:
     """:return: the parser of the commands"""
     parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents by the scores of several seeds.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command resumes where it stopped")
-    run.add_argument("folder", type=absolute, help="output folder")
+    # An absolute path is valid on every machine of a cluster.
+    run.add_argument("folder", type=lambda path: pathlib.Path(path).resolve(), help="output folder")
     run.set_defaults(default_seeds=SEEDS)  # apart from --seeds, which shows whether it was given
     run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, smoke-atari, or one from --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")

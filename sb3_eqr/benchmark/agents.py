@@ -24,17 +24,12 @@ UNRELATED = ("_init_setup_model", "device", "policy_kwargs", "seed", "tensorboar
 
 
 class Agent(NamedTuple):
-    """
-    :param name: name in tables: "qrdqn", "qrdqn:stock", "eqr_rainbow:se2+aet"
-    :param algo: RL Zoo's name of the algorithm
-    :param file: file of hyperparameters
-    :param changes: hyperparameters that override those of the file; dictionaries are merged
-    """
+    """An algorithm of RL Zoo with its hyperparameters."""
 
-    name: str
+    name: str  # in tables: "qrdqn", "qrdqn:stock", "eqr_rainbow:se2+aet"
     algo: str
-    file: pathlib.Path
-    changes: dict[str, Any] = {}
+    file: pathlib.Path  # of hyperparameters
+    changes: dict[str, Any] = {}  # they override those of the file; dictionaries are merged
 
 
 def find_agent(text: str) -> Agent:
@@ -51,8 +46,8 @@ def find_agent(text: str) -> Agent:
         raise ValueError(f"--agents: there is no algorithm {algo!r}.{nearest_name(algo, ALGOS)}")
     files = configuration_files()
     if not entries:
-        own = files[algo] if algo in AGENTS else pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
-        return Agent(algo, algo, own)
+        theirs = pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
+        return Agent(algo, algo, files[algo] if algo in AGENTS else theirs)
     if entries == OFF and algo in AGENTS:
         return Agent(text, algo, files[algo], {"prediction_depth": 0, "policy_kwargs": {"group": None}})
     if match := re.fullmatch(r"(.+\.ya?ml)(?::(.+))?", entries):
@@ -60,26 +55,24 @@ def find_agent(text: str) -> Agent:
             raise ValueError(f"--agents: {text!r}: there is no file {match[1]}")
         return _agent_of_file(algo, pathlib.Path(match[1]).resolve(), match[2])
     name = f"{STOCK}/{algo}" if entries == STOCK else entries
-    legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
-    longer = [key for key in legal if key.startswith(entries)]
-    if name not in files and len(longer) == 1:
-        entries = name = longer[0]
-    if name not in files and longer:
-        raise ValueError(
-            f"--agents: {text!r} must be a prefix of one name, got one of {', '.join(sorted(longer))}. Choose one of them."
-        )
     if name not in files:
-        legal += [STOCK] if f"{STOCK}/{algo}" in files else []
-        legal += [OFF] if algo in AGENTS else []
-        raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
+        legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
+        longer = sorted(key for key in legal if key.startswith(entries))
+        if len(longer) > 1:
+            raise ValueError(
+                f"--agents: {text!r} must be a prefix of one name, got one of {', '.join(longer)}. Choose one of them."
+            )
+        if not longer:
+            legal += [STOCK] * (f"{STOCK}/{algo}" in files) + [OFF] * (algo in AGENTS)
+            raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
+        entries = name = longer[0]
     return Agent(f"{algo}:{entries}", algo, files[name])
 
 
 def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Agent:
     """
-    The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries.
-
-    :param name: the name of one of several agents with ``base`` and ``changes`` in the file
+    The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries; ``name``
+    is that of one of several such pairs in the file.
     """
     found = yaml.safe_load(file.read_text(encoding="utf-8"))
     if name is not None:
@@ -121,9 +114,7 @@ def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces
     """
     The agent's entry for a game, checked; exits with a message if it is missing or invalid.
 
-    :param agent: the agent
     :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`; its preprocessing overrides the entry's
-    :param action_space: the game's action space
     :return: the entry as in the file, with the suite's steps, and a replay buffer no larger than these steps can fill
     :raises ValueError: if the agent does not support the game's actions, or its entry changes the environment
     """

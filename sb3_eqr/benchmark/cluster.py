@@ -12,48 +12,37 @@ from sb3_eqr.benchmark.dispatch import Crash
 from sb3_eqr.benchmark.runs import Run, Settings
 from sb3_eqr.benchmark.training import execute
 
-LOCAL = "local"  # the address of this machine
-
 
 class Cluster:
     """
     A Ray task per run, with the methods of :class:`~sb3_eqr.benchmark.dispatch.Processes`; Ray decides how many run at once.
 
-    :param settings: settings of all runs
-    :param address: address of a Ray cluster that can access the benchmark's folder, or ``LOCAL``
-    :param cpus_per_run: CPUs that Ray reserves for a run
-    :param gpus_per_run: GPUs that Ray reserves for a run, such as 0.1 for ten runs per GPU
+    :param address: of a Ray cluster that can access the benchmark's folder, or "local" for this machine
+    :param cpus: CPUs that Ray reserves for a run
+    :param gpus: GPUs that Ray reserves for a run, such as 0.1 for ten runs per GPU
     :raises ConnectionError: if no cluster answers at the address
     :raises ValueError: if no machine of the cluster has the resources of a run, which would wait forever
     """
 
-    def __init__(self, settings: Settings, address: str, cpus_per_run: float, gpus_per_run: float):
-        self.slots = math.inf
+    slots = math.inf
+
+    def __init__(self, settings: Settings, address: str, cpus: float, gpus: float):
         self._settings = settings
         connect(address)
-        try:
-            for name, flag, needed in (("CPU", "--cpus-per-run", cpus_per_run), ("GPU", "--gpus-per-run", gpus_per_run)):
-                there = max((node["Resources"].get(name, 0) for node in ray.nodes() if node["Alive"]), default=0)
-                if needed > there:
-                    raise ValueError(f"{flag} must be <= {there:g}, the {name}s of the largest machine, got {needed:g}.")
-        except ValueError:
-            ray.shutdown()
-            raise
-        self._task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=0)(execute)
+        for name, flag, needed in (("CPU", "--cpus-per-run", cpus), ("GPU", "--gpus-per-run", gpus)):
+            there = max((node["Resources"].get(name, 0) for node in ray.nodes() if node["Alive"]), default=0)
+            if needed > there:
+                ray.shutdown()
+                raise ValueError(f"{flag} must be <= {there:g}, the {name}s of the largest machine, got {needed:g}.")
+        self._task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(execute)
 
     def start(self, run: Run) -> Any:
-        """:return: the reference of the run's result"""
         return self._task.remote(run, self._settings)
 
     def wait(self, handles: list[Any], timeout: float) -> list[Any]:
-        """:return: the reference of a run that has ended, if there is one"""
         return ray.wait(handles, timeout=timeout)[0]
 
     def outcome(self, handle: Any) -> str:
-        """
-        :return: what the run's task returned
-        :raises Crash: if the task raised an exception, or its worker died
-        """
         try:
             return ray.get(handle)
         except ray.exceptions.RayError as error:
@@ -61,8 +50,7 @@ class Cluster:
             raise Crash(" ".join([type(cause).__name__, *str(cause).strip().splitlines()[-1:]])) from error
 
     def close(self) -> None:
-        """Disconnect, which ends the tasks."""
-        ray.shutdown()
+        ray.shutdown()  # which ends the tasks
 
 
 def connect(address: str) -> None:
@@ -77,7 +65,7 @@ def connect(address: str) -> None:
             ) from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # as Ray's own warning recommends
-    local: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
+    local: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **local)
     except ConnectionError as error:

@@ -1,6 +1,7 @@
 """The commands ``sb3-eqr benchmark run|status|report|pack``, apart from the parser, whose help needs none of these imports."""
 
 import argparse
+import contextlib
 import os
 import pathlib
 import shlex
@@ -10,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from sb3_eqr.benchmark.dispatch import Processes, finish, make_table
+from sb3_eqr.benchmark.dispatch import Processes, finish, last_line, make_table
 from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
@@ -24,7 +25,7 @@ def check_resources(args: argparse.Namespace) -> str:
     :return: the device of every run
     :raises ValueError: for resources that are invalid or not available
     """
-    for flag, is_right, needed in (
+    for name, is_right, needed in (
         ("cpus_per_run", args.cpus_per_run > 0, "> 0"),
         ("gpus_per_run", args.gpus_per_run >= 0, ">= 0"),
         ("checkpoint_every", args.checkpoint_every >= 0, ">= 0 seconds"),
@@ -34,7 +35,7 @@ def check_resources(args: argparse.Namespace) -> str:
         ("episodes", args.episodes is None or args.episodes >= 1, ">= 1"),
     ):
         if not is_right:
-            raise ValueError(f"--{flag.replace('_', '-')} must be {needed}, got {getattr(args, flag):g}.")
+            raise ValueError(f"--{name.replace('_', '-')} must be {needed}, got {getattr(args, name):g}.")
     if args.ray is None and args.gpus_per_run:
         raise ValueError(
             f"--gpus-per-run needs --ray, got {args.gpus_per_run:g} without it. --device cuda --jobs 16 shares a GPU."
@@ -51,8 +52,6 @@ def check_resources(args: argparse.Namespace) -> str:
 
 def make_pool(args: argparse.Namespace, settings: Settings) -> Any:
     """
-    :param args: arguments of ``run``
-    :param settings: settings of all runs
     :return: where the runs are executed
     :raises ImportError: if Ray is asked for and not installed
     """
@@ -73,22 +72,20 @@ def _command() -> str:
 
 def make_plan(args: argparse.Namespace) -> list[Run]:
     """
-    :param args: arguments of ``run``
     :return: the runs of the benchmark, whose plan is in its folder
     :raises ValueError: for invalid arguments
     """
     if args.suite is None and args.agents is None:
         for name in ("suite_file", "games", "seeds", "first_seed", "steps", "episodes"):
             if getattr(args, name):
-                flag = f"--{name.replace('_', '-')}"
-                raise ValueError(f"{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
         return with_present_defaults(read_plan(args.folder))
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")
     suite = choose(load_suite(args.suite, args.suite_file), args.games, args.steps, args.episodes)
-    runs = plan_runs(
-        args.folder, suite, args.agents, read_seeds(args.seeds or str(args.default_seeds), args.first_seed), _command()
-    )
+    seeds = read_seeds(args.seeds or str(args.default_seeds), args.first_seed)
+    runs = plan_runs(args.folder, suite, args.agents, seeds, _command())
     write_plan(args.folder, suite, runs)
     return runs
 
@@ -107,8 +104,8 @@ def read_seeds(text: str, first: int) -> list[int]:
     return found if len(found) > 1 else list(range(first, first + found[0]))
 
 
-def run(args: argparse.Namespace) -> int:
-    """:return: exit status: 1 if a run failed"""
+def run(args: argparse.Namespace) -> bool:
+    """:return: whether a run failed"""
     import_packages(args.gym_packages)
     device = check_resources(args)
     runs = make_plan(args)
@@ -129,11 +126,8 @@ def run(args: argparse.Namespace) -> int:
     if not console.is_terminal:  # which shows a table that changes
         print(f"Progress: sb3-eqr benchmark status {shlex.quote(str(args.folder))}", flush=True)
     if waiting:
-        pool = make_pool(args, settings)
-        try:
+        with contextlib.closing(make_pool(args, settings)) as pool:
             failed = finish(pool, runs, waiting, settings, console)
-        finally:
-            pool.close()
     for lost in failed:
         print(f"failed: {lost.label}: {lost.folder / ERROR}")
     if failed:
@@ -144,48 +138,44 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         print(f"All runs are finished. sb3-eqr benchmark report {shlex.quote(str(args.folder))}")
-    return 1 if failed else 0
+    return bool(failed)
 
 
-def status(args: argparse.Namespace) -> int:
-    """:return: exit status"""
+def status(args: argparse.Namespace) -> None:
+    """Print the table of runs and why some failed."""
     runs = read_plan(args.folder)
     states = [run.state() for run in runs]
     Console().print(make_table(runs, states))
     for run, state in zip(runs, states, strict=True):
         if state.name == "failed":
-            reason = (run.folder / ERROR).read_text(encoding="utf-8").strip().splitlines()[-1]
-            print(f"failed: {run.label}: {reason}")
-    return 0
+            print(f"failed: {run.label}: {last_line(run)}")
 
 
-def report(args: argparse.Namespace) -> int:
-    """:return: exit status"""
+def report(args: argparse.Namespace) -> None:
+    """Write the report."""
     from sb3_eqr.benchmark.report import write_report  # rliable and seaborn take seconds to import
 
     references = {}
     for text in args.reference:
-        name, separator, path = text.partition("=")
-        if not (name and separator and path):
+        name, _, path = text.partition("=")
+        if not (name and path):
             raise ValueError(f"--reference must be NAME=FILE, got {text!r}.")
         references[name] = pathlib.Path(path)
     first = args.folders[0]
     output = args.output or (pathlib.Path(first.name.partition(".")[0] + "_report") if first.is_file() else first / "report")
     path = write_report(args.folders, references, args.force, output, args.agents, args.baseline, _command())
     print(f"Written: {path}")
-    return 0
 
 
-def pack_runs(args: argparse.Namespace) -> int:
-    """:return: exit status"""
+def pack_runs(args: argparse.Namespace) -> None:
+    """Pack the runs of a folder."""
     print(f"{pack(args.folder, args.file)} runs in {args.file}")
-    return 0
 
 
 def execute(args: argparse.Namespace) -> None:
     """Run a command and exit with its status, or with a message and status 2 if the user has to do something."""
     try:
-        sys.exit({"run": run, "status": status, "report": report, "pack": pack_runs}[args.command](args))
+        sys.exit(int({"run": run, "status": status, "report": report, "pack": pack_runs}[args.command](args) or 0))
     except (ValueError, ImportError, ConnectionError, OSError) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:

@@ -8,13 +8,14 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
+from functools import partial
 from multiprocessing import connection
 from typing import Any
 
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
+from rich.table import Column, Table
 
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, State
 from sb3_eqr.benchmark.training import execute
@@ -33,32 +34,22 @@ class Crash(Exception):
 
 
 class Processes:
-    """
-    A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods.
-
-    :param settings: settings of all runs
-    :param slots: number of processes at once
-    """
+    """A pool of processes, one per run, which returns all memory of the run when it ends. A cluster has the same methods."""
 
     def __init__(self, settings: Settings, slots: int):
-        self.slots: float = slots
+        self.slots = slots  # number of processes at once
         self._settings = settings
         self._open: dict[Any, Run] = {}
+        os.environ["OMP_NUM_THREADS"] = str(settings.n_threads)  # inherited, and read by PyTorch when it is imported
 
     def start(self, run: Run) -> Any:
-        """
-        Start a process. It inherits its number of threads, which PyTorch reads when it is imported, and that Ctrl-C, which
-        reaches every process of a terminal, is the parent's to handle.
-        """
+        """:return: a process that ignores Ctrl-C, which reaches every process of a terminal and is for the parent to handle"""
         process = SPAWN.Process(target=work, args=(run, self._settings))
-        threads, handler = os.environ.get("OMP_NUM_THREADS"), signal.signal(signal.SIGINT, signal.SIG_IGN)
-        os.environ["OMP_NUM_THREADS"] = str(self._settings.n_threads)
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited
         try:
             process.start()
         finally:
             signal.signal(signal.SIGINT, handler)
-            del os.environ["OMP_NUM_THREADS"]
-            os.environ |= {} if threads is None else {"OMP_NUM_THREADS": threads}
         self._open[process] = run
         return process
 
@@ -69,8 +60,8 @@ class Processes:
 
     def outcome(self, handle: Any) -> str:
         """
-        :return: what the run's process returned
-        :raises Crash: if a signal killed it, or an exception ended it
+        :return: what :func:`execute` returned
+        :raises Crash: if a signal killed the process, or an exception ended it
         """
         handle.join()
         run = self._open.pop(handle)
@@ -101,26 +92,22 @@ def work(run: Run, settings: Settings) -> None:
 
 def _end_with_parent() -> None:
     """A parent that is killed cannot end its processes."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    multiprocessing.parent_process().join()  # type: ignore[union-attr]
+    os._exit(1)
 
 
 def last_line(run: Run) -> str:
     """:return: the last line of what stopped a run, or of what it printed; "" without either"""
     for path in (run.folder / ERROR, run.folder / LOG):
-        lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
-        if found := [line.strip() for line in lines if line.strip()]:
-            return found[-1]
+        if path.is_file() and (text := path.read_text(encoding="utf-8", errors="replace").strip()):
+            return text.split("\n")[-1].strip()
     return ""
 
 
 def make_table(runs: list[Run], states: list[State]) -> Table:
     """:return: a row per agent, and one for all agents"""
-    table = Table(box=None, pad_edge=False, caption_justify="left")
-    for column in ("agent", "done", "running", "waiting", "failed", "steps", "steps/s"):
-        table.add_column(column, justify="left" if column == "agent" else "right")
+    numbers = [Column(name, justify="right") for name in ("done", "running", "waiting", "failed", "steps", "steps/s")]
+    table = Table("agent", *numbers, box=None, pad_edge=False, caption_justify="left")
     for name in [*dict.fromkeys(run.agent.name for run in runs), "all"]:
         rows = [(run, state) for run, state in zip(runs, states, strict=True) if name in (run.agent.name, "all")]
         counts = Counter(state.name for _, state in rows)
@@ -140,28 +127,24 @@ def finish(pool: Any, runs: list[Run], waiting: list[Run], settings: Settings, c
     Execute runs: interrupted ones resume from their last checkpoint, runs that another process holds are waited for. A run
     that crashes twice has failed; the others continue. When ``settings.stop_at`` has passed, no further run starts.
 
-    :param pool: where to execute them
-    :param runs: runs of the benchmark
-    :param waiting: the runs that are not finished, in order
-    :param settings: settings of all runs
-    :param console: where to print the table
+    :param runs: all runs, for the table
+    :param waiting: those that are not finished, in order
     :return: the runs that failed
     """
     states = [run.state() for run in runs]
-    queue, running, failed = deque(waiting), dict[Any, Run](), []
-    busy: list[tuple[float, Run]] = []  # when to retry
+    queue, running, failed = list(waiting), dict[Any, Run](), []
+    busy_until: dict[str, float] = {}  # for runs that another process holds
     crashes: Counter[str] = Counter()
+    say = partial(console.print, soft_wrap=True, markup=False, highlight=False)  # a line above the table
     with Live(make_table(runs, states), console=console, auto_refresh=False, transient=True) as live:
-        while running or queue or busy:
+        while running or queue:
             if settings.is_over():
                 queue.clear()
-                busy.clear()
-            queue.extend(run for when, run in busy if when <= time.monotonic())
-            busy = [(when, run) for when, run in busy if run not in queue]
-            while queue and len(running) < pool.slots:
-                run = queue.popleft()
-                running[pool.start(run)] = run
-            if not running and busy:
+            for run in [run for run in queue if busy_until.get(run.label, 0) <= time.monotonic()]:
+                if len(running) < pool.slots:
+                    queue.remove(run)
+                    running[pool.start(run)] = run
+            if queue and not running:
                 time.sleep(REFRESH_SECONDS)
             for handle in pool.wait(list(running), REFRESH_SECONDS) if running else []:
                 run = running.pop(handle)
@@ -169,30 +152,27 @@ def finish(pool: Any, runs: list[Run], waiting: list[Run], settings: Settings, c
                     outcome = pool.outcome(handle)
                 except Crash as crash:
                     crashes[run.label] += 1
-                    is_lost = crashes[run.label] == ATTEMPTS
-                    _note_crash(run, crash, is_lost, console)
-                    if is_lost:
-                        failed.append(run)
+                    if crashes[run.label] < ATTEMPTS:
+                        say(f"{run.label}: crashed ({crash}). Retrying once.")
+                        queue.insert(0, run)
                     else:
-                        queue.appendleft(run)
+                        say(f"{run.label}: crashed ({crash}). See {run.folder / ERROR}")
+                        _note_crash(run, crash)
+                        failed.append(run)
                     continue
                 if outcome == "busy":
-                    busy.append((time.monotonic() + BUSY_SECONDS, run))
+                    busy_until[run.label] = time.monotonic() + BUSY_SECONDS
+                    queue.append(run)
                 else:
-                    _say(console, f"{run.label}: {outcome}")
+                    say(f"{run.label}: {outcome}")
             states = [state if state.name == "done" else run.state() for run, state in zip(runs, states, strict=True)]
             live.update(make_table(runs, states), refresh=console.is_terminal)
     console.print(make_table(runs, states))
     return failed
 
 
-def _note_crash(run: Run, crash: Crash, is_lost: bool, console: Console) -> None:
-    _say(console, f"{run.label}: crashed ({crash}). {f'See {run.folder / ERROR}' if is_lost else 'Retrying once.'}")
-    if is_lost and not (run.folder / ERROR).is_file():  # killed before it could write one
+def _note_crash(run: Run, crash: Crash) -> None:
+    """A run that is killed cannot write its error itself."""
+    if not (run.folder / ERROR).is_file():
         with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
             file.write(str(crash).encode())
-
-
-def _say(console: Console, text: str) -> None:
-    """Print a line above the table."""
-    console.print(text, soft_wrap=True, markup=False, highlight=False)

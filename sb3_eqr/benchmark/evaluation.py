@@ -4,6 +4,7 @@ of a ``protocol`` see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`.
 """
 
 import copy
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -22,41 +23,18 @@ from sb3_eqr.common.saving.random_state import preserved_rng_state
 FIRST_SEED, SEEDS = 1_000_000, 1_000  # evaluation shares no episodes with training, nor with another run's evaluation
 
 
-class EpsilonGreedy:
-    """
-    A policy for SB3's ``evaluate_policy``: the agent's deterministic action or, with probability ``epsilon``, a random one.
+def epsilon_greedy(model: BaseAlgorithm, epsilon: float, action_space: spaces.Space, seed: int) -> Any:
+    """A policy for SB3's ``evaluate_policy``: the agent's deterministic action or, with probability ``epsilon``, any."""
+    action_space, rng = copy.deepcopy(action_space), np.random.default_rng(seed)
+    action_space.seed(seed)
 
-    :param model: the agent
-    :param epsilon: probability of a random action
-    :param action_space: space to sample random actions from
-    :param seed: seed of the random actions
-    """
-
-    def __init__(self, model: BaseAlgorithm, epsilon: float, action_space: spaces.Space, seed: int):
-        self._model = model
-        self._epsilon = epsilon
-        self._action_space = copy.deepcopy(action_space)
-        self._action_space.seed(seed)
-        self._rng = np.random.default_rng(seed)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: (n_envs, *obs_shape)
-        :param state: hidden states of a recurrent agent
-        :param episode_start: (n_envs,)
-        :param deterministic: ignored
-        :return: actions, (n_envs, ...), and hidden states
-        """
-        actions, state = self._model.predict(observation, state, episode_start, deterministic=True)
-        for index in np.flatnonzero(self._rng.random(len(actions)) < self._epsilon):
-            actions[index] = self._action_space.sample()
+    def predict(observation: Any, state: Any, episode_start: np.ndarray, deterministic: bool) -> tuple[np.ndarray, Any]:
+        actions, state = model.predict(observation, state, episode_start, deterministic=True)
+        for index in np.flatnonzero(rng.random(len(actions)) < epsilon):
+            actions[index] = action_space.sample()
         return actions, state
+
+    return SimpleNamespace(predict=predict)
 
 
 def preprocessing_of(protocol: dict[str, Any]) -> dict[str, Any]:
@@ -95,7 +73,7 @@ def check_game(protocol: dict[str, Any]) -> spaces.Space:
 def make_evaluation_env(protocol: dict[str, Any], model: BaseAlgorithm, seed: int) -> VecEnv:
     """
     :param model: the agent; if it was trained with normalised observations, its statistics are used
-    :param seed: seed of the first environment; the others' seeds count up from it
+    :param seed: of the first environment; the others' seeds count up from it
     """
     # Monitor is outside the wrappers, so that it sees the protocol's episodes.
     env = make_vec_env(make_game, n_envs=protocol["evaluation"]["n_envs"], seed=seed, env_kwargs={"protocol": protocol})
@@ -116,16 +94,14 @@ def evaluate(model: BaseAlgorithm, protocol: dict[str, Any], n_episodes: int, se
     Scores and lengths of full episodes. Every environment plays a fixed share of them, so that short episodes are not
     overrepresented. Neither the agent nor the random generators change.
 
-    :param n_episodes: number of episodes
-    :param seed: seed of the run
+    :param seed: of the run
     """
     seed = FIRST_SEED + SEEDS * seed
     with preserved_rng_state(model.action_space):
         env = make_evaluation_env(protocol, model, seed)
         try:
-            player = EpsilonGreedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
-            scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)  # type: ignore[arg-type]
+            player = epsilon_greedy(model, protocol["evaluation"]["epsilon"], env.action_space, seed)
+            scores, lengths = evaluate_policy(player, env, n_episodes, return_episode_rewards=True, warn=False)
         finally:
             env.close()
-    assert isinstance(scores, list) and isinstance(lengths, list)
-    return [float(score) for score in scores], [int(length) for length in lengths]
+    return np.asarray(scores, dtype=float).tolist(), np.asarray(lengths, dtype=int).tolist()

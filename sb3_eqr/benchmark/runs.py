@@ -25,23 +25,14 @@ STARTS = "starts.txt"  # a line for each time that a run starts or resumes
 
 
 class Settings(Strict):
-    """
-    Settings that do not affect the scores.
-
-    :param device: PyTorch device
-    :param n_threads: number of PyTorch threads
-    :param checkpoint_seconds: seconds between checkpoints
-    :param gym_packages: packages that register environments
-    :param save_models: whether to save trained agents in the format of RL Zoo
-    :param stop_at: when to stop, in seconds since the epoch; ``None``: never
-    """
+    """Settings that do not affect the scores."""
 
     device: str = "auto"
-    n_threads: int = 1
-    checkpoint_seconds: float = 300.0
-    gym_packages: list[str] = []
-    save_models: bool = False
-    stop_at: float | None = None
+    n_threads: int = 1  # of PyTorch
+    checkpoint_seconds: float = 300.0  # between checkpoints
+    gym_packages: list[str] = []  # which register environments
+    save_models: bool = False  # of trained agents, in the format of RL Zoo
+    stop_at: float | None = None  # in seconds since the epoch; None: never
 
     def is_over(self) -> bool:
         """:return: whether the time to stop has passed"""
@@ -49,42 +40,31 @@ class Settings(Strict):
 
 
 class State(NamedTuple):
-    """
-    :param name: "done", "running", "failed" or "waiting"
-    :param step: training steps done
-    :param steps_per_second: 0 unless the run is running
-    """
+    """The progress of a run."""
 
-    name: str
-    step: int
-    steps_per_second: float
+    name: str  # "done", "running", "failed" or "waiting"
+    step: int  # training steps done
+    steps_per_second: float = 0.0  # while it is running
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
     """
-    One agent on one game with one seed.
+    One agent on one game with one seed, in a folder of its own.
 
-    :param folder: folder of the run
-    :param agent: the agent
-    :param suite: name of the suite
-    :param game: name of the game
-    :param seed: seed of agent, environments and evaluation
-    :param protocol: see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`
-    :param entry: see :func:`~sb3_eqr.benchmark.agents.hyperparameters`
-    :param command: the command that planned the run, with its suite and agents
-    :param defaults: see :func:`~sb3_eqr.benchmark.agents.defaults`; empty for a run of a version that did not record them
+    For ``protocol``, ``entry`` and ``defaults`` see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`,
+    :func:`~sb3_eqr.benchmark.agents.hyperparameters` and :func:`~sb3_eqr.benchmark.agents.defaults`.
     """
 
     folder: pathlib.Path
     agent: Agent
-    suite: str
+    suite: str  # its name
     game: str
-    seed: int
+    seed: int  # of agent, environments and evaluation
     protocol: dict[str, Any]
     entry: dict[str, Any]
-    command: str = ""
-    defaults: dict[str, Any] = dataclasses.field(default_factory=dict)
+    command: str = ""  # that planned the run, with its suite and agents
+    defaults: dict[str, Any] = dataclasses.field(default_factory=dict)  # empty in plans of versions that did not record them
 
     @property
     def label(self) -> str:
@@ -106,9 +86,8 @@ class Run:
 
     def state(self) -> State:
         """:return: the progress of the run"""
-        steps = self.protocol["steps"]
         if (self.folder / RESULT).is_file():
-            return State("done", steps, 0.0)
+            return State("done", self.protocol["steps"])
         if self.is_locked():
             try:
                 progress = json.loads((self.folder / PROGRESS).read_text(encoding="utf-8"))
@@ -117,11 +96,35 @@ class Run:
             return State("running", progress.get("step", 0), progress.get("steps_per_second", 0.0))
         kept = find_checkpoints(self.folder)  # from which it resumes
         step = int(kept[-1].name.removeprefix(PREFIX)) if kept else 0
-        return State("failed" if (self.folder / ERROR).is_file() else "waiting", step, 0.0)
+        return State("failed" if (self.folder / ERROR).is_file() else "waiting", step)
 
     def has_begun(self) -> bool:
-        """:return: whether there is something that further steps would continue, or a result"""
-        return (self.folder / RESULT).is_file() or bool(find_checkpoints(self.folder)) or self.is_locked()
+        """:return: whether the plan says how it was started: there is a result, or something that more steps would continue"""
+        is_planned = (self.folder / PLAN).is_file()
+        return is_planned and ((self.folder / RESULT).is_file() or bool(find_checkpoints(self.folder)) or self.is_locked())
+
+    def write_plan(self) -> None:
+        """Write ``run.json``, unless the run has begun."""
+        if not self.has_begun():
+            write_json(self.folder / PLAN, self.description())
+
+    def check_plan(self) -> None:
+        """:raises ValueError: if the run has begun with other settings"""
+        if not self.has_begun():
+            return
+        old = json.loads((self.folder / PLAN).read_text(encoding="utf-8"))
+        new = json.loads(to_json(self.description()))
+        for what in ("protocol", "entry", "defaults"):
+            if not old.get(what):
+                continue  # begun by a version that did not record the defaults
+            before, now = flatten(old[what]), flatten(new[what])
+            for key in sorted((before.keys() | now.keys()) - {"file"}):
+                was, is_now = before.get(key), now.get(key)
+                if was != is_now:
+                    raise ValueError(
+                        f"{self.folder}: {key} must be {was!r}, as when the run was started, got {is_now!r}. "
+                        "Scores of different settings are not comparable: use another folder, or the same settings."
+                    )
 
     def is_locked(self) -> bool:
         """:return: whether a process holds the run"""
@@ -162,12 +165,11 @@ def plan_runs(folder: pathlib.Path, suite: Suite, agents: list[str], seeds: Sequ
         action_space = check_game(protocol)
         for agent in found:
             entry = hyperparameters(agent, protocol, action_space)
-            for seed in seeds:
-                place = folder / "runs" / agent.name.replace(":", "-") / game.replace("/", "-") / str(seed)
-                unnamed = defaults(agent, entry)
-                runs.append(Run(place, agent, suite.name, game, seed, protocol, entry, command, unnamed))
+            place = folder / "runs" / agent.name.replace(":", "-") / game.replace("/", "-")
+            settings = protocol, entry, command, defaults(agent, entry)
+            runs += [Run(place / str(seed), agent, suite.name, game, seed, *settings) for seed in seeds]
     for run in runs:
-        _check_plan(run)
+        run.check_plan()
     return sorted(runs, key=lambda run: seeds.index(run.seed))
 
 
@@ -177,33 +179,14 @@ def with_present_defaults(runs: list[Run]) -> list[Run]:
     :raises ValueError: if a run that has begun was started with others
     """
     register()
-    found = [
-        run if (run.folder / RESULT).is_file() else dataclasses.replace(run, defaults=defaults(run.agent, run.entry))
-        for run in runs
-    ]
-    for run in found:
-        _check_plan(run)
-        if not run.has_begun():
-            write_json(run.folder / PLAN, run.description())
+    found = []
+    for run in runs:
+        if not (run.folder / RESULT).is_file():
+            run = dataclasses.replace(run, defaults=defaults(run.agent, run.entry))
+        run.check_plan()
+        run.write_plan()
+        found.append(run)
     return found
-
-
-def _check_plan(run: Run) -> None:
-    """:raises ValueError: if the folder holds the same run, started with other settings"""
-    path = run.folder / PLAN
-    if not (path.is_file() and run.has_begun()):
-        return
-    old, new = json.loads(path.read_text(encoding="utf-8")), json.loads(to_json(run.description()))
-    for what in ("protocol", "entry", "defaults"):
-        if not old.get(what):
-            continue  # begun by a version that did not record the defaults
-        before, now = (flatten({key: v for key, v in plan[what].items() if key != "file"}) for plan in (old, new))
-        for key in sorted(before.keys() | now.keys()):
-            if before.get(key) != now.get(key):
-                raise ValueError(
-                    f"{run.folder}: {key} must be {before.get(key)!r}, as when the run was started, got {now.get(key)!r}. "
-                    "Scores of different settings are not comparable: use another folder, or the same settings."
-                )
 
 
 def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
@@ -217,8 +200,7 @@ def write_plan(folder: pathlib.Path, suite: Suite, runs: list[Run]) -> None:
         path = folder / SUITE
         write_suite(merge(read_suite(path), suite) if path.is_file() else suite, path)
     for run in runs:
-        if not ((run.folder / PLAN).is_file() and run.has_begun()):  # else it says how the run was started
-            write_json(run.folder / PLAN, run.description())
+        run.write_plan()
 
 
 def read_plan(folder: pathlib.Path) -> list[Run]:

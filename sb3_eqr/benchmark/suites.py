@@ -60,25 +60,16 @@ class Normalisation(Strict):
 
 
 class Suite(Strict):
-    """
-    :param name: name of the suite
-    :param games: names of the games, as given by the user
-    :param env_id: gymnasium's name of a game's environment, with "{game}" in place of the game, or game -> name
-    :param env_kwargs: game -> arguments of its environment
-    :param steps: training steps of the agent, per game; in a file also one number for all games
-    :param preprocessing: keys of RL Zoo's entries (``env_wrapper``, ``frame_stack``, ...) that override an agent's own
-    :param evaluation: the evaluation; its preprocessing defaults to that of training
-    :param normalisation: in a file, "human" means random play 0, a human tester 1; the default is raw scores
-    """
+    """The games of a benchmark, and how they are trained on, evaluated and normalised."""
 
     name: str
     games: Annotated[list[str], Len(1)]
-    env_id: str | dict[str, str]
-    env_kwargs: dict[str, dict[str, Any]] = {}
-    steps: dict[str, PositiveInt]
-    preprocessing: dict[str, Any] = {}
-    evaluation: Evaluation
-    normalisation: Normalisation
+    env_id: str | dict[str, str]  # gymnasium's name of the environments, with "{game}" for the game, or game -> name
+    env_kwargs: dict[str, dict[str, Any]] = {}  # game -> arguments of its environment
+    steps: dict[str, PositiveInt]  # training steps of the agent, per game; in a file also one number for all games
+    preprocessing: dict[str, Any] = {}  # keys of RL Zoo's entries, such as frame_stack, that override an agent's own
+    evaluation: Evaluation  # its preprocessing defaults to that of training
+    normalisation: Normalisation  # in a file, "human" means random play 0, a human tester 1; the default is raw scores
 
     @model_validator(mode="before")
     @classmethod
@@ -103,18 +94,16 @@ class Suite(Strict):
         folders = [game.replace("/", "-") for game in self.games]
         if unfit := [game for game, name in zip(self.games, folders, strict=True) if folders.count(name) > 1 or "\\" in name]:
             raise ValueError(f"games must have names that differ as names of folders, got {', '.join(unfit)}.")
-        needed: dict[str, Any] = {"steps": self.steps, "normalisation: scores": self.normalisation.scores}
-        for what, there in (needed if isinstance(self.env_id, str) else {"env_id": self.env_id, **needed}).items():
+        named = self.games if isinstance(self.env_id, str) else self.env_id
+        for what, there in {"env_id": named, "steps": self.steps, "normalisation: scores": self.normalisation.scores}.items():
             if missing := [game for game in self.games if game not in there]:
                 raise ValueError(f"{what} must have every game, got none for {', '.join(missing)}.")
         return self
 
     def protocol(self, game: str) -> dict[str, Any]:
         """:return: the settings that two scores must share to be comparable"""
-        evaluation, own = (
-            self.evaluation.model_dump(),
-            {"env_kwargs": self.env_kwargs[game]} if game in self.env_kwargs else {},
-        )
+        evaluation = self.evaluation.model_dump()
+        own = {"env_kwargs": self.env_kwargs[game]} if game in self.env_kwargs else {}
         return {
             "env_id": self.env_id.format(game=game) if isinstance(self.env_id, str) else self.env_id[game],
             "steps": self.steps[game],
@@ -131,15 +120,13 @@ def nearest_name(name: str, legal: Iterable[str]) -> str:
 
 def human_scores(games: list[str]) -> dict[str, Any]:
     """:return: the normalisation of Atari 100K: random play 0, a human tester 1"""
-    table = load_reference().pivot(index="game", columns="method", values="mean")
-    known = {game: table.loc[game.lower()] for game in games if game.lower() in table.index}
-    scores = {game: [float(row[RANDOM]), float(row[HUMAN])] for game, row in known.items()}
+    table = load_reference().pivot(index="game", columns="method", values="mean")[[RANDOM, HUMAN]]
+    scores = {game: table.loc[game.lower()].tolist() for game in games if game.lower() in table.index}
     return {"unit": "human-normalised score", "source": "EqR paper, Table 2", "scores": scores}
 
 
 def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     """
-    :param name: name of the suite
     :param where: name of the file, for messages
     :param entry: an entry as in suites.yml
     :raises ValueError: for an invalid or incomplete entry
@@ -172,7 +159,6 @@ def first_mistake(error: ValidationError) -> str:
 
 def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     """
-    :param name: name of a suite
     :param file: an additional file of suites, which override ours of the same name
     :raises ValueError: for an unknown suite, with the nearest name, or an invalid one
     """
@@ -188,28 +174,25 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
             raise ValueError(f"{file} must be a mapping of suites by name, got {type(own).__name__}. See docs/benchmark.md.")
         entries |= {key: (file, entry) for key, entry in own.items()}
     if name not in entries:
-        raise ValueError(
-            f"--suite: there is no suite {name!r}.{nearest_name(name, entries)} --suite-file FILE adds suites of your own."
-        )
+        nearby = nearest_name(name, entries)
+        raise ValueError(f"--suite: there is no suite {name!r}.{nearby} --suite-file FILE adds suites of your own.")
     path, entry = entries[name]
     return make_suite(name, path.name, entry)
 
 
 def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: int | None = None) -> Suite:
     """
-    :param suite: the suite
     :param games: the games to keep, ignoring case; ``None``: all
     :param steps: training steps that override the suite's
     :param episodes: episodes of the final evaluation that override the suite's
     :raises ValueError: for a game that the suite or gymnasium does not have, with the nearest name
     """
     envs.register()
-    kept = suite.games
-    if games is not None:
-        for game in games:
-            if game.lower() not in map(str.lower, suite.games):
-                raise ValueError(f"--games: suite {suite.name!r} has no game {game!r}.{nearest_name(game, suite.games)}")
-        kept = [game for game in suite.games if game.lower() in map(str.lower, games)]
+    wanted = suite.games if games is None else games
+    for game in wanted:
+        if game.lower() not in map(str.lower, suite.games):
+            raise ValueError(f"--games: suite {suite.name!r} has no game {game!r}.{nearest_name(game, suite.games)}")
+    kept = [game for game in suite.games if game.lower() in map(str.lower, wanted)]
     per_game = suite.steps if steps is None else dict.fromkeys(kept, steps)
     for game in kept:
         env_id = suite.protocol(game)["env_id"]
@@ -232,18 +215,17 @@ def merge(old: Suite, new: Suite) -> Suite:
         raise ValueError(
             f"The runs must be of suite {old.name!r}, as those that are there, got {new.name!r}. Use another place."
         )
+    games = [*dict.fromkeys([*old.games, *new.games])]
     scores = old.normalisation.scores | new.normalisation.scores
-    update: dict[str, Any] = {"normalisation": new.normalisation.model_copy(update={"scores": scores})}
-    update |= {"games": [*dict.fromkeys([*old.games, *new.games])], "steps": old.steps | new.steps}
-    return new.model_copy(update=update)
+    normalisation = new.normalisation.model_copy(update={"scores": scores})
+    return new.model_copy(update={"games": games, "steps": old.steps | new.steps, "normalisation": normalisation})
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:
-    """Write a suite in full, including defaults."""
+    """Write a suite in full, including defaults, for :func:`read_suite`."""
     with atomic_write(path, "yml") as file:
         file.write(yaml.safe_dump(suite.model_dump(), sort_keys=False).encode())
 
 
 def read_suite(path: pathlib.Path) -> Suite:
-    """:param path: a file written by :func:`write_suite`"""
     return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import datetime
 import importlib.metadata
-import os
+import io
 import pathlib
 import platform
 import re
@@ -12,7 +12,6 @@ import shutil
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,16 +25,15 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import get_device, should_collect_more_steps
 
-from sb3_eqr import envs
 from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, STOPPED, Run, Settings, write_json
-from sb3_eqr.common.resets import Resets
 from sb3_eqr.common.saving import checkpoints
 from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints, write_checkpoint
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.models import SafeFiles
 from sb3_eqr.common.saving.plain_data import decode
+from sb3_eqr.envs import import_packages
 from sb3_eqr.zoo import AGENTS, register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
@@ -58,9 +56,7 @@ def new_record() -> dict[str, Any]:
 
 class LossWriter(KVWriter):
     """
-    Collects the losses and the gradients at the state that SB3 logs, and what LatentCallback does.
-
-    :param losses: a row is appended at each dump of the log; keys without "train/"
+    :param losses: gets a row at each dump of SB3's log: the losses, the gradients at the state and what LatentCallback does
     """
 
     def __init__(self, losses: list[dict[str, float]]):
@@ -74,29 +70,6 @@ class LossWriter(KVWriter):
             self._losses.append({"step": step, **row})
 
 
-class Clock:
-    """
-    Adds elapsed time to a record.
-
-    :param record: see :func:`new_record`
-    """
-
-    def __init__(self, record: dict[str, Any]):
-        self._record = record
-        self._last = time.monotonic()
-
-    def read(self, what: str) -> None:
-        """
-        Add the time since the last reading.
-
-        :param what: what the time was spent on: "training_seconds", or "seconds" for anything else
-        """
-        now = time.monotonic()
-        for key in {what, "seconds"}:
-            self._record[key] += now - self._last
-        self._last = now
-
-
 class OutOfTime(Exception):
     """``settings.stop_at`` has passed, and the checkpoint is written."""
 
@@ -106,19 +79,16 @@ class RunCallback(BaseCallback):
     Records training scores and progress, evaluates, writes checkpoints, and stops after exactly the requested steps; a rollout
     that these steps cut short is not trained on. Raises ``OutOfTime`` between two rollouts.
 
-    :param run: the run
     :param record: the measurements so far
-    :param settings: the settings
+    :param started: when the process took up the run, by the monotonic clock
     """
 
-    def __init__(self, run: Run, record: dict[str, Any], settings: Settings):
+    def __init__(self, run: Run, record: dict[str, Any], settings: Settings, started: float):
         super().__init__()
         self.run, self.record, self.settings = run, record, settings
-        self.steps = run.protocol["steps"]
-        curve = run.protocol["evaluation"]["curve"]
-        self.due = [self.steps * point // curve["points"] for point in range(1, curve["points"])]
-        self.curve_episodes = curve["episodes"]
-        self.clock = Clock(record)
+        self.steps, self.curve = run.protocol["steps"], run.protocol["evaluation"]["curve"]
+        self.counted = started
+        self.count_time()
         self.noted = 0.0
         self.saved = time.monotonic()
 
@@ -129,31 +99,36 @@ class RunCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         is_over = self.settings.is_over()
         if is_over or time.monotonic() - self.saved >= self.settings.checkpoint_seconds:
-            self.clock.read("training_seconds")
+            self.count_time("training_seconds")
             write_checkpoint(self.run.folder, self.model, self.record)
-            self.clock.read("seconds")
+            self.count_time()
             self.saved = time.monotonic()
         if is_over:
             raise OutOfTime
 
     def _on_step(self) -> bool:
-        for info in self.locals.get("infos", []):
-            if "episode" in info:
-                found = {"step": self.num_timesteps, "score": float(info["episode"]["r"]), "length": int(info["episode"]["l"])}
-                for key, value in found.items():
-                    self.record["training"][key].append(value)
+        training = self.record["training"]
+        for episode in [info["episode"] for info in self.locals.get("infos", []) if "episode" in info]:
+            training["step"].append(self.num_timesteps)
+            training["score"].append(float(episode["r"]))
+            training["length"].append(int(episode["l"]))
         if time.monotonic() - self.noted >= PROGRESS_SECONDS:
-            self.clock.read("training_seconds")
             self.note_progress()
         if self.is_due() and self.has_settled():
-            self.clock.read("training_seconds")
-            add_evaluation(self.model, self.run, self.record, "curve", self.curve_episodes)
-            self.clock.read("seconds")
+            self.count_time("training_seconds")
+            add_evaluation(self.model, self.run, self.record, "curve", self.curve["episodes"])
+            self.count_time()
         return self.num_timesteps < self.steps or self.ends_rollout()
 
     def _on_training_end(self) -> None:
-        self.clock.read("training_seconds")
         self.note_progress()
+
+    def count_time(self, what: str = "seconds") -> None:
+        """Add the time since the last call to the record's "seconds" and, if it was training, to its "training_seconds"."""
+        now = time.monotonic()
+        for key in {what, "seconds"}:
+            self.record[key] += now - self.counted
+        self.counted = now
 
     def ends_rollout(self) -> bool:
         """
@@ -168,21 +143,23 @@ class RunCallback(BaseCallback):
 
     def is_due(self) -> bool:
         """:return: whether a point of the learning curve has been reached since the last evaluation"""
+        points = self.curve["points"]
         last = max((row["step"] for row in self.record["evaluations"]), default=0)
-        return any(last < step <= self.num_timesteps < self.steps for step in self.due)
+        return any(last < self.steps * point // points <= self.num_timesteps < self.steps for point in range(1, points))
 
     def has_settled(self) -> bool:
         """
         :return: whether half of the updates between two resets of the network are done; right after a reset, the agent
             performs like an untrained one
         """
-        resets: Resets | None = getattr(self.model, "_resets", None)
-        if resets is None or resets.schedule.interval is None or not resets.done:
+        resets: Any = getattr(self.model, "_resets", None)
+        if resets is None or not resets.done:
             return True
         return 2 * resets.updates_since(self.model._n_updates) >= resets.schedule.interval  # type: ignore[attr-defined]
 
     def note_progress(self) -> None:
         """Write the run's progress, for the table."""
+        self.count_time("training_seconds")
         seconds = self.record["training_seconds"] - self.first_second
         rate = (self.num_timesteps - self.first_step) / seconds if seconds > 0 else 0.0
         progress = {"step": self.num_timesteps, "steps": self.steps, "steps_per_second": rate, "host": platform.node()}
@@ -191,11 +168,7 @@ class RunCallback(BaseCallback):
 
 
 def add_evaluation(model: BaseAlgorithm, run: Run, record: dict[str, Any], kind: str, n_episodes: int) -> None:
-    """
-    Evaluate the agent and add the scores to the record.
-
-    :param kind: "curve" or "final"
-    """
+    """Evaluate the agent and add the scores to the record; ``kind`` is "curve" or "final"."""
     scores, lengths = evaluate(model, run.protocol, n_episodes, run.seed)
     record["evaluations"].append({"step": model.num_timesteps, "kind": kind, "scores": scores, "lengths": lengths})
 
@@ -208,7 +181,7 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     """
     env_id, kwargs = run.protocol["env_id"], run.entry.get("env_kwargs")
     args = argparse.Namespace(env=env_id, env_kwargs=kwargs, gym_packages=settings.gym_packages, seed=run.seed)
-    with tempfile.TemporaryDirectory() as aside, silence():
+    with tempfile.TemporaryDirectory() as aside, contextlib.redirect_stdout(io.StringIO()):  # RL Zoo prints
         config = pathlib.Path(aside) / "entry.yml"
         entry = {key: value for key, value in run.entry.items() if value is not None or key not in WORLD}  # null: none
         if run.agent.algo in AGENTS and get_device(settings.device).type == "cuda":
@@ -226,38 +199,29 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
             device=settings.device,
             config=str(config),
         )
-        experiment = manager.setup_experiment()
-        assert experiment is not None
-        model = experiment[0]
-        old = model.get_env()
+        model, _ = manager.setup_experiment()  # type: ignore[misc]
+        logged = model.get_env()
         model.set_env(manager.create_envs(manager.n_envs, no_log=True))
-        if old is not None:
-            old.close()
+        logged.close()  # type: ignore[union-attr]
     return model, manager
 
 
-@contextlib.contextmanager
-def silence() -> Iterator[None]:
-    """Leave out what RL Zoo prints."""
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        yield
-
-
-def save_model(model: BaseAlgorithm, manager: ExperimentManager, run: Run, logs: pathlib.Path) -> None:
-    """Save the agent in the folder of :func:`build` as ``sb3-eqr train`` does, without its log of episodes."""
-    with silence():
+def save_model(model: BaseAlgorithm, manager: ExperimentManager, run: Run) -> None:
+    """Save the agent in the folder of :func:`build` as ``sb3-eqr train`` does, without its log of episodes; then rename it."""
+    with contextlib.redirect_stdout(io.StringIO()):
         manager.save_trained_model(model)
     pathlib.Path(manager.params_path, "command.txt").write_text(run.command, encoding="utf-8")
+    logs = pathlib.Path(manager.log_folder)
     for log in logs.rglob("*.monitor.csv"):
         log.unlink()
+    shutil.rmtree(run.folder / MODELS, ignore_errors=True)
+    logs.rename(run.folder / MODELS)
 
 
 def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[BaseAlgorithm, dict[str, Any], bool]:
     """
-    Like an EqR agent's ``resume``, for all agents of Stable-Baselines3.
+    Like an EqR agent's ``resume``, for all agents of Stable-Baselines3. The class, device and environment are the model's.
 
-    :param checkpoint: see :func:`~sb3_eqr.common.saving.checkpoints.write_checkpoint`
-    :param model: a new agent, whose class, device and environment are used
     :return: the resumed agent, the measurements so far, and whether it resumes bit for bit; if not, with a new episode
     """
     checkpoint, manifest = checkpoints.read_manifest(checkpoint)
@@ -278,29 +242,39 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
     return model, decode(manifest["notes"]), is_exact
 
 
-def remove_checkpoints(folder: pathlib.Path) -> None:
-    """Remove the checkpoints of a finished run, and partial files that a killed run left."""
+def clean_up(folder: pathlib.Path) -> None:
+    """Remove what only an unfinished run needs, and partial files that a killed one left."""
     for checkpoint in find_checkpoints(folder):
         checkpoints.discard(checkpoint)
     for path in [*folder.glob(f".{PREFIX}*"), folder / f".{MODELS}"]:
         shutil.rmtree(path, ignore_errors=True)
+    for name in (STARTS, STOPPED):
+        (folder / name).unlink(missing_ok=True)
 
 
-def provenance(run: Run, model: BaseAlgorithm, settings: Settings) -> dict[str, Any]:
-    """:return: what was run, with versions and machine"""
-    versions = {}
+def make_row(run: Run, model: BaseAlgorithm, record: dict[str, Any]) -> dict[str, Any]:
+    """:return: the content of ``result.json``: what was requested, versions and machine, times, and measurements"""
+    versions = {"python": platform.python_version()}
     for package in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-    device = th.cuda.get_device_name(model.device) if model.device.type == "cuda" else model.device.type
     captured: Any = getattr(model, "_captured", None)  # as a CUDA graph
-    updates = "eager" if captured is None else f"eager: {captured.failure}" if captured.failure else "captured"
-    machine = {"device": device, "updates": updates, "threads": th.get_num_threads()}
-    return {
-        **run.description(),
-        "versions": {"python": platform.python_version(), **versions},
-        "machine": {**machine, "platform": platform.platform(), "host": platform.node()},
+    machine = {
+        "device": th.cuda.get_device_name(model.device) if model.device.type == "cuda" else model.device.type,
+        "updates": "eager" if captured is None else f"eager: {captured.failure}" if captured.failure else "captured",
+        "threads": th.get_num_threads(),
+        "platform": platform.platform(),
+        "host": platform.node(),
     }
+    starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
+    times = {
+        "started": starts[0],
+        "attempts": len(starts),
+        "wall_clock_s": round(record["seconds"], 2),
+        "steps_per_second": round(model.num_timesteps / max(record["training_seconds"], 1e-9), 2),
+    }
+    measured = {key: value for key, value in record.items() if key != "seconds"}
+    return {**run.description(), "versions": versions, "machine": machine, **times, **measured}
 
 
 def train(run: Run, settings: Settings) -> str:
@@ -310,13 +284,11 @@ def train(run: Run, settings: Settings) -> str:
     :return: "finished", or "stopped" if ``settings.stop_at`` came first: then a checkpoint and ``stopped.json`` are written
     """
     started = time.monotonic()
-    envs.register()
-    envs.import_packages(settings.gym_packages)
     register()
+    import_packages(settings.gym_packages)
     with open(run.folder / STARTS, "a", encoding="utf-8") as file:
         file.write(datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds") + "\n")
-    models = run.folder / MODELS
-    logs = models.with_name(f".{MODELS}")
+    logs = run.folder / f".{MODELS}"
     shutil.rmtree(logs, ignore_errors=True)  # of a killed run
     model, manager = build(run, settings, logs)
     record = new_record()
@@ -325,45 +297,23 @@ def train(run: Run, settings: Settings) -> str:
         model, record, is_exact = load_checkpoint(found[-1], model)
         record["resumed_at"].append(model.num_timesteps)
         record["resumed_exactly"] &= is_exact
-    record["seconds"] += time.monotonic() - started
-    steps = run.protocol["steps"]
-    if model.num_timesteps < steps:
+    callback = RunCallback(run, record, settings, started)
+    if (left := run.protocol["steps"] - model.num_timesteps) > 0:
         model.set_logger(Logger(folder=None, output_formats=[LossWriter(record["losses"])]))
-        callback = RunCallback(run, record, settings)
         try:
-            model.learn(steps - model.num_timesteps, [*manager.callbacks, callback], reset_num_timesteps=not found)
+            model.learn(left, [*manager.callbacks, callback], reset_num_timesteps=not found)
         except OutOfTime:
-            row = {
-                "stopped_at": model.num_timesteps,
-                **provenance(run, model, settings),
-                **times(run, model, record),
-                **record,
-            }
-            write_json(run.folder / STOPPED, row)
+            write_json(run.folder / STOPPED, {"stopped_at": model.num_timesteps, **make_row(run, model, record)})
             return "stopped"
         write_checkpoint(run.folder, model, record, with_buffer=False)
-    finishing = Clock(record)
     add_evaluation(model, run, record, "final", run.protocol["evaluation"]["episodes"])
-    finishing.read("seconds")
+    callback.count_time()
     if settings.save_models:
-        save_model(model, manager, run, logs)
-        shutil.rmtree(models, ignore_errors=True)
-        logs.rename(models)
-    write_json(run.folder / RESULT, {**provenance(run, model, settings), **times(run, model, record), **record})
+        save_model(model, manager, run)
+    write_json(run.folder / RESULT, make_row(run, model, record))
     model.get_env().close()  # type: ignore[union-attr]
-    remove_checkpoints(run.folder)
+    clean_up(run.folder)
     return "finished"
-
-
-def times(run: Run, model: BaseAlgorithm, record: dict[str, Any]) -> dict[str, Any]:
-    """:return: when the run started and how long it took; the record's "seconds" are moved into it"""
-    starts = (run.folder / STARTS).read_text(encoding="utf-8").split()
-    return {
-        "started": starts[0],
-        "attempts": len(starts),
-        "wall_clock_s": round(record.pop("seconds"), 2),
-        "steps_per_second": round(model.num_timesteps / max(record["training_seconds"], 1e-9), 2),
-    }
 
 
 def execute(run: Run, settings: Settings) -> str:
@@ -377,7 +327,7 @@ def execute(run: Run, settings: Settings) -> str:
     try:
         with FileLock(run.folder / LOCK, blocking=False):
             if (run.folder / RESULT).is_file():
-                remove_checkpoints(run.folder)  # left by a process that was killed after writing the result
+                clean_up(run.folder)  # of a process that was killed after writing the result
                 return "finished"
             th.set_num_threads(settings.n_threads)
             (run.folder / ERROR).unlink(missing_ok=True)  # of an earlier attempt
@@ -389,8 +339,7 @@ def execute(run: Run, settings: Settings) -> str:
                 if isinstance(error, SystemExit):  # would also end Ray's worker
                     raise RuntimeError(f"{run.agent.file} cannot be used (exit {error.code})") from error
                 raise
-            for name in (PROGRESS, *((STARTS, STOPPED) if outcome == "finished" else ())):
-                (run.folder / name).unlink(missing_ok=True)
+            (run.folder / PROGRESS).unlink(missing_ok=True)
             return outcome
     except Timeout:
         return "busy"
