@@ -9,9 +9,10 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecFrameStack
+from torch.utils._pytree import tree_map_only
 
 from sb3_eqr.common.cuda_graph import CapturedGradients
-from tests.models import EITHER, loss_terms
+from tests.models import EITHER, all_finite, loss_terms, same
 from tests.toys import ChainEnv, ImageEnv
 
 ENVS = {
@@ -26,13 +27,10 @@ NEEDS_GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 @EITHER
 def test_without_a_gpu_updates_are_eager_and_a_warning_says_why(make):
     eager = make(ChainEnv()).learn(46)
-    with pytest.warns(
-        UserWarning, match="cuda_graph: updates run eagerly, because a CUDA graph needs a GPU.* 'cpu'"
-    ) as caught:
+    with pytest.warns(UserWarning, match="updates run eagerly, because a CUDA graph needs a GPU.* 'cpu'") as caught:
         asked = make(ChainEnv(), cuda_graph=True).learn(46)
     assert len([w for w in caught if "cuda_graph" in str(w.message)]) == 1 and asked._n_updates == 12
-    for (name, a), (_, b) in zip(eager.policy.state_dict().items(), asked.policy.state_dict().items(), strict=True):
-        assert th.equal(a, b), name
+    assert same(eager, asked)
     with pytest.warns(UserWarning, match="cuda_graph"):
         copy = pickle.loads(pickle.dumps(asked))
     assert copy.cuda_graph and copy._captured is not None
@@ -48,14 +46,8 @@ def test_the_objective_reads_no_number_from_the_device(make, policy, network):
     model.replay_buffer.device = th.device("cpu")
     filler = make(ENVS[policy](), policy, learning_starts=1_000, prioritized_replay=False).learn(50)
     samples = filler.replay_buffer.sample(8)
-    moved = {}
-    for name, field in samples._asdict().items():
-        if isinstance(field, dict):
-            moved[name] = {key: value.to("meta") for key, value in field.items()}
-        elif isinstance(field, th.Tensor):
-            moved[name] = field.to("meta")
     model.policy.set_training_mode(True)
-    terms = loss_terms(model, samples._replace(**moved))
+    terms = loss_terms(model, tree_map_only(th.Tensor, lambda value: value.to("meta"), samples))
     terms.loss.backward()
     model.policy.update_target(0.5)
     gradients = [p.grad for p in model.policy.parameters() if p.grad is not None]
@@ -138,8 +130,7 @@ def test_replays_use_the_samples_weights_and_parameters_of_their_call(make, monk
     monkeypatch.setattr("sb3_eqr.common.eqr_algorithm.CapturedGradients", Recorded)
     eager, replayed = changed_run(make), changed_run(make, cuda_graph=True)
     assert replayed._captured._graph is not None and replayed._resets.done == eager._resets.done == [40, 80, 120, 160]
-    states = [model.policy.state_dict() for model in (eager, replayed)]
-    assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+    assert same(eager, replayed)
 
 
 @pytest.mark.gpu
@@ -168,4 +159,4 @@ def test_updates_that_cannot_be_captured_run_eagerly(make):
     with pytest.warns(UserWarning, match="cuda_graph: updates run eagerly, because"):
         model = make(ChainEnv(), device="cuda", cuda_graph=True, policy_kwargs=network).learn(80)
     assert model._captured.failure is not None and model._n_updates == 80
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert all_finite(model)
