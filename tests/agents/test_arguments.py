@@ -129,7 +129,7 @@ OUT_OF_RANGE = {
     "algorithm": {"tau": 1.5, "gamma": 1.01, "aet_coef": -1.0, "td_coef": None, "batch_size": 32.0, "n_steps": 0}
     | {"shift_pixels": 2.5, "prediction_depth": -1, "target_update_interval": 0, "train_freq": (1, "hour")},
     "policy_kwargs": {"n_blocks": 0, "latent_hidden_dim": 0, "sigma_init": -1.0, "n_atoms": 1, "n_quantiles": 0}
-    | {"v_max": float("inf"), "parameterization": "angles", "reward_loss": "huber", "aet_loss": "nce", "projection": "mine"},
+    | {"v_max": float("inf"), "reward_loss": "huber", "aet_loss": "nce", "projection": "mine"},
     "replay_buffer_kwargs": {"alpha": -1.0, "beta": 1.4, "final_beta": 1.5, "frame_stack": 0},
     "resets": {"interval": 0, "initial_n_steps": 0, "initial_gamma": -0.1, "annealing_steps": 0, "shrink_factor": 1.5},
 }

@@ -23,24 +23,18 @@ SMALL = {"learning_starts": 140, "buffer_size": 400, "batch_size": 8, "device": 
 
 # name: encoder, auxiliary losses
 EXPECTED = {
-    "eqr_rainbow": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "paper": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "released": ("SE(2)^12", {"aet", "symmetry", "reward"}),
     "mlp+aet+r": ("none(512)^1", {"aet", "reward"}),
     "t2+aet+r": ("T(2)^32", {"aet", "reward"}),
     "se2+aet+r": ("SE(2)^12", {"aet", "reward"}),
     "gl2+aet+r": ("GL(2)^12", {"aet", "reward"}),
     "se2+aet": ("SE(2)^12", {"aet"}),
     "se2+aet+get": ("SE(2)^12", {"aet", "symmetry"}),
-    "se2+aet+r+get": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "rainbow": (None, set()),
-    "qrdqn": (None, set()),
-    "der": (None, set()),
-    "drq": (None, set()),
     "spr": (None, {"aet"}),
     "deepmdp": ("none(512)^1", {"aet", "reward"}),
-    "eqr_bbf": ("SE(2)^12", {"aet", "symmetry", "reward"}),
 }
+FULL = ("eqr_rainbow", "paper", "released", "se2+aet+r+get", "eqr_bbf")
+EXPECTED |= dict.fromkeys(FULL, ("SE(2)^12", {"aet", "symmetry", "reward"}))
+EXPECTED |= dict.fromkeys(("rainbow", "qrdqn", "der", "drq"), (None, set()))
 
 
 def rows(text):

@@ -46,6 +46,7 @@ from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv, SampledEnv
         ({"policy_kwargs": {"group": None}}, "Pass symmetry_coef=0"),
         ({"policy_kwargs": {"group": "none"}}, "Pass symmetry_coef=0"),
         ({"policy_kwargs": {"group": None, "whiten": True}, "symmetry_coef": 0}, "group must not be None if whiten=True"),
+        ({"policy_kwargs": {"parameterization": "angles"}}, "parameterization must be one of"),
         ({"policy_kwargs": {"aet_loss": "nce"}}, "aet_loss must be one of .*contrastive.*got 'nce'"),
         ({"td_coef": 0, "prediction_depth": 0}, "td_coef must be > 0 if all auxiliary losses are disabled"),
         ({"policy_kwargs": {**PAPER, "net_arch": []}}, "at least one hidden layer.*projection"),
@@ -61,26 +62,47 @@ def test_arguments_out_of_range(make, kwargs, message):
         make(ChainEnv(), **kwargs)
 
 
-@EITHER
+DICT, IMAGES, VECTORS = {"policy": "MultiInputPolicy"}, {"policy": "CnnPolicy"}, ("mlp", "flatten")
+NO_DICTS, OUTSIDE = "must accept dicts, got .*Use MultiInputPolicy", r"Use VecNormalize\(VecTransposeImage\(env\)\)"
+
+
 @pytest.mark.parametrize(
-    "space, message",
+    "env, kwargs, message",
     [
-        (spaces.Discrete(5, start=1), "observation_space must start at 0"),
-        (spaces.MultiDiscrete([5, 2], start=[0, 1]), "observation_space must start at 0"),
-        (spaces.Box(-1, 1, (), np.float32), "observation_space must have at least one axis"),
-        (spaces.Dict({"a": spaces.Box(-1, 1, (), np.float32)}), r"observation_space\['a'\] must have at least one axis"),
+        (lambda: ChainEnv, {}, r"env must be an environment or a VecEnv, got .*make_vec_env"),
+        (lambda: 3, {}, r"env must be an environment or a VecEnv, got .*make_vec_env"),
+        (lambda: SampledEnv(spaces.Discrete(5, start=1)), {}, "observation_space must start at 0"),
+        (lambda: SampledEnv(spaces.MultiDiscrete([5, 2], start=[0, 1])), {}, "observation_space must start at 0"),
+        (lambda: SampledEnv(spaces.Box(-1, 1, ())), {}, "observation_space must have at least one axis"),
+        (lambda: SampledEnv(spaces.Dict({"a": spaces.Box(-1, 1, ())})), DICT, r"\['a'\] must have at least one axis"),
+        (lambda: make_vec_env(ChainEnv, 4), {"buffer_size": 23}, "buffer_size=24"),
+        (ChainEnv, IMAGES, "MlpPolicy for vectors"),
+        (lambda: ImageEnv((3, 20, 20)), IMAGES, "at least 36x36"),
+        (lambda: ImageEnv((3, 40, 36), dtype=np.float32), IMAGES, "normalize_images=False"),
+        (ImageEnv, IMAGES | {"replay_buffer_kwargs": {"frame_stack": 2}}, "frame_stack must divide"),
+        (SimpleMultiObsEnv, {}, "MultiInputPolicy"),
+        *((SimpleMultiObsEnv, DICT | {"policy_kwargs": {"features_extractor_class": trunk}}, NO_DICTS) for trunk in VECTORS),
+        (lambda: VecNormalize(make_vec_env(IntegerEnv), norm_obs_keys=["count"]), DICT, "of 'count'. Pass norm_obs=False"),
+        (lambda: VecNormalize(VecTransposeImage(make_vec_env(ImageEnv))), IMAGES, "normalise floats, .*DtypeObservation"),
+        (lambda: VecNormalize(make_vec_env(ImageEnv), norm_obs=False), IMAGES, OUTSIDE),
+        (lambda: VecNormalize(VecFrameStack(make_vec_env(ImageEnv), 2), norm_obs=False), IMAGES, OUTSIDE),
     ],
 )
-def test_observation_spaces_that_fit_no_network(make, space, message):
+def test_environments_that_do_not_fit(make, env, kwargs, message):
     with pytest.raises(ValueError, match=message):
-        make(SampledEnv(space), "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy")
+        make(env(), **kwargs)
 
 
-@EITHER
-@pytest.mark.parametrize("trunk", ["mlp", "flatten"])
-def test_trunks_for_vectors_refuse_dicts(make, trunk):
-    with pytest.raises(ValueError, match=r"must accept dicts, got .*Use MultiInputPolicy and leave"):
-        make(SimpleMultiObsEnv(channel_last=False), "MultiInputPolicy", policy_kwargs={"features_extractor_class": trunk})
+@pytest.mark.parametrize("stacked", [False, True])
+def test_vec_normalize_outside_of_the_other_wrappers(make, stacked):
+    env = VecFrameStack(make_vec_env(ImageEnv), 2) if stacked else make_vec_env(ImageEnv)
+    assert make(VecNormalize(VecTransposeImage(env), norm_obs=False), "CnnPolicy").learn(60)._n_updates > 0
+
+
+@pytest.mark.parametrize("low, high", [(10.0, 10.0), (3, 1)])
+def test_a_support_without_values(low, high):
+    with pytest.raises(ValueError, match=f"v_min must be a finite number < v_max = {high}, got {low}"):
+        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"v_min": low, "v_max": high})
 
 
 @EITHER
@@ -89,14 +111,7 @@ def test_a_layer_norm_of_the_observations_warns(make):
         make(ChainEnv(), policy_kwargs={"features_extractor_class": "flatten"})
 
 
-def test_the_minimum_buffer_size_is_per_environment(make):
-    with pytest.raises(ValueError, match="buffer_size=24"):
-        make(make_vec_env(ChainEnv, 4), buffer_size=23)
-
-
 def test_observations_that_are_not_a_frame_stack(make):
-    with pytest.raises(ValueError, match="frame_stack must divide"):
-        make(ImageEnv((3, 36, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 2})
     model = make(ImageEnv((4, 40, 36)), "CnnPolicy", replay_buffer_kwargs={"frame_stack": 4})
     with pytest.raises(ValueError, match=r'frame_stack=4: each observation must.*"frame_stack": 1'):
         model.learn(50)
@@ -138,10 +153,6 @@ def test_a_rejected_step_does_not_change_the_statistics_of_vec_normalize(make, w
 
 def test_integers_behind_vec_normalize(make):
     """SB3 would scale their terminal observations, clip them, scale them back and cut them to integers."""
-    with pytest.raises(ValueError, match=r"floats, got integers of 'count'\. Pass norm_obs=False, or norm_obs_keys"):
-        make(VecNormalize(make_vec_env(IntegerEnv), norm_obs_keys=["count"]), "MultiInputPolicy")
-    with pytest.raises(ValueError, match=r"must normalise floats, got integers\. .*DtypeObservation"):
-        make(VecNormalize(VecTransposeImage(make_vec_env(ImageEnv))), "CnnPolicy")
     env = VecNormalize(make_vec_env(IntegerEnv), norm_obs=False)
     model = make(env, "MultiInputPolicy", learning_starts=1_000).learn(20)
     stored = model.replay_buffer.windows(np.array([6]), np.array([0])).rollout_observations["kind"]
@@ -232,35 +243,12 @@ def test_setting_n_steps_beyond_the_buffer_raises(make):
         model.train(1, 8)
 
 
-@pytest.mark.parametrize("stacked", [False, True])
-def test_vec_normalize_inside_a_wrapper_that_changes_observations(make, stacked):
-    env = make_vec_env(ImageEnv)
-    wrong = VecNormalize(VecFrameStack(env, 2) if stacked else env, norm_obs=False)
-    with pytest.raises(ValueError, match="Use VecNormalize\\(VecTransposeImage\\(env\\)\\)"):
-        make(wrong, "CnnPolicy")
-    right = VecNormalize(VecTransposeImage(VecFrameStack(env, 2) if stacked else env), norm_obs=False)
-    assert make(right, "CnnPolicy").learn(60)._n_updates > 0
-
-
 def test_greedy_exploration_warns_without_resets(make):
     with pytest.warns(UserWarning, match="exploration_final_eps"):
         make(ChainEnv(), policy_kwargs={"noisy": False})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})
-
-
-@pytest.mark.parametrize(
-    "support, message",
-    [
-        ({"v_min": 10.0}, "v_min must be a finite number < v_max = 10.0, got 10.0"),
-        ({"v_min": 3, "v_max": 1}, "v_min must be a finite number < v_max = 1, got 3"),
-    ],
-    ids=str,
-)
-def test_invalid_supports(support, message):
-    with pytest.raises(ValueError, match=message):
-        EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs=support)
 
 
 class ScriptedRewards(ChainEnv):
@@ -366,12 +354,6 @@ def test_devices(make):
 def test_every_error_names_the_wrong_argument():
     found = wrong_arguments()
     assert found.holds, found.details
-
-
-@pytest.mark.parametrize("env", [ChainEnv, 3])
-def test_invalid_environments(make, env):
-    with pytest.raises(ValueError, match=r"env must be an environment or a VecEnv, got .*make_vec_env"):
-        make(env)
 
 
 def test_an_argument_without_effect_warns():

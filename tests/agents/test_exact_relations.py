@@ -24,7 +24,8 @@ NETWORK |= {"optimizer_kwargs": {"eps": 1e-4, "fused": True}}
 def assert_same_networks(ours, theirs):
     assert ours._n_updates == theirs._n_updates > 0
     for name in ("quantile_net", "quantile_net_target"):
-        assert same(list(getattr(ours, name).parameters()), list(getattr(theirs, name).parameters()))
+        mine, other = (list(getattr(model, name).parameters()) for model in (ours, theirs))
+        assert mine and same(mine, other)
 
 
 @pytest.mark.parametrize("n_envs, n_steps, max_grad_norm, tau", [(1, 1, None, 1.0), (1, 3, 10.0, 1.0), (3, 5, 0.5, 0.3)])
