@@ -40,31 +40,6 @@ class ChainEnv(gym.Env):
         return self.observe(), self.position, terminated, self.time >= self.length and not terminated, {}
 
 
-class ImageEnv(gym.Env):
-    """Random images, channels first or last, with episodes of a fixed length."""
-
-    def __init__(self, shape=(36, 36, 1), length=7, dtype=np.uint8):
-        high = 255 if dtype == np.uint8 else 1
-        self.observation_space = spaces.Box(0, high, shape, dtype)
-        self.action_space = spaces.Discrete(3)
-        self.length, self.time = length, 0
-
-    def observe(self):
-        image = self.np_random.integers(0, 256, self.observation_space.shape)
-        if self.observation_space.dtype == np.uint8:
-            return image.astype(np.uint8)
-        return (image / 255).astype(self.observation_space.dtype)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return self.observe(), {}
-
-    def step(self, action):
-        self.time += 1
-        return self.observe(), float(action == 1), self.time % (2 * self.length) == 0, self.time == self.length, {}
-
-
 class PoisonEnv(ChainEnv):
     """Returns a bad value at a chosen step: ``where`` is "obs", "reward", "terminal" or "reset"."""
 
@@ -110,6 +85,13 @@ class SampledEnv(gym.Env):
         self.n_episodes += ends
         truncated = ends and self.n_episodes % 2 == 1
         return self.observe(), self.time / self.length, ends and not truncated, truncated, {}
+
+
+class ImageEnv(SampledEnv):
+    """Images, channels first or last."""
+
+    def __init__(self, shape=(36, 36, 1), length=7, dtype=np.uint8):
+        super().__init__(spaces.Box(0, 255 if dtype == np.uint8 else 1, shape, dtype), length)
 
 
 class DictEnv(SampledEnv):

@@ -106,7 +106,10 @@ def test_combinations_of_attributes_set_later_are_checked_when_learning_starts()
         EqRRainbow("MlpPolicy", ChainEnv(), batch_size=1, prediction_depth=0, policy_kwargs={"whiten": True})
 
 
-@pytest.mark.parametrize("name, value", [("aux_gradient_share", 0.5), ("double_q", False), ("intensity_scale", 0.1)])
+LATER = {"aux_gradient_share": 0.5, "double_q": False, "intensity_scale": 0.1, "n_steps": 3, "gamma": 0.5}
+
+
+@pytest.mark.parametrize("name, value", LATER.items())
 def test_an_attribute_set_later_has_the_effect_of_the_argument(name, value):
     def train(**given):
         model = EqRRainbow("CnnPolicy", ImageEnv(), buffer_size=200, learning_starts=20, batch_size=8, seed=0, **given)
@@ -116,13 +119,6 @@ def test_an_attribute_set_later_has_the_effect_of_the_argument(name, value):
 
     given, later = train(**{name: value}), train()
     assert same(given, later)
-
-
-def test_resets_set_later():
-    model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=20, batch_size=8)
-    model.resets = {"interval": 10}
-    model.learn(80)
-    assert model.resets == ResetSchedule(interval=10) and model._resets.done
 
 
 OUT_OF_RANGE = {

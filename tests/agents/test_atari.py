@@ -19,14 +19,9 @@ def games(env):
     return env.venv.envs
 
 
-@pytest.mark.parametrize("game", ["Pong", "PongNoFrameskip-v4", "ALE/Pong-v5", "pong"])
-def test_all_names_of_a_game(game):
-    assert atari.atari_env_id(game) == "ALE/Pong-v5"
-
-
-def test_names_of_two_words_and_unknown_games():
-    assert atari.atari_env_id("MsPacman") == atari.atari_env_id("ms_pacman") == atari.atari_env_id("Ms Pacman")
-    assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
+def test_all_names_of_a_game_and_unknown_games():
+    assert {atari.atari_env_id(name) for name in ("Pong", "PongNoFrameskip-v4", "ALE/Pong-v5", "pong")} == {"ALE/Pong-v5"}
+    assert {atari.atari_env_id(name) for name in ("MsPacman", "ms_pacman", "Ms Pacman")} == {"ALE/MsPacman-v5"}
     with pytest.raises(ValueError, match="Did you mean 'Pong'"):
         make_atari100k_env("Pnog")
     for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # a different protocol
