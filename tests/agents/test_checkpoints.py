@@ -182,9 +182,7 @@ def test_the_environment_must_be_built_in_the_same_way(checkpoint):
 
 def test_an_environment_of_another_id_is_refused_and_other_arguments_are_named(tmp_path):
     EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(60, ExactCheckpointCallback(50, tmp_path))
-    with pytest.raises(
-        ValueError, match=r"must be the environment of the original run.*'CartPole-v1' there, 'CartPole-v0' here"
-    ):
+    with pytest.raises(ValueError, match=r"the environment of the original run.*'CartPole-v1' there, 'CartPole-v0' here"):
         EqRQRDQN.resume(tmp_path, make_vec_env("CartPole-v0"))
     shorter = make_vec_env("CartPole-v1", env_kwargs={"max_episode_steps": 50, "sutton_barto_reward": True})
     with pytest.warns(UserWarning, match=r"max_episode_steps = 500 there, 50 here, kwargs = .* there, .*sutton_barto"):

@@ -98,15 +98,12 @@ def test_the_full_agent_is_the_default():
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
     default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
     default._setup_learn(100_000, None)  # learning_starts follows the length of the run
-    for key, value in load_configuration("eqr_rainbow").items():
-        if key not in ("policy_kwargs", "replay_buffer_kwargs", "train_freq"):
-            assert getattr(default, key) == value, key
-    for key, value in load_configuration("eqr_rainbow")["replay_buffer_kwargs"].items():
-        assert getattr(default.replay_buffer, key) == value, key
-    assert default.train_freq == named.train_freq
-    for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
-        found = {**vars(default.policy), **vars(default.policy.options)}[key]
-        assert (12 if found is None else found) == value  # the default of n_blocks depends on the group
+    assert default.train_freq == named.train_freq and default.policy.latent_model.n_blocks == 12
+    written = load_configuration("eqr_rainbow")
+    written |= written.pop("replay_buffer_kwargs") | written.pop("policy_kwargs")
+    found = {**vars(default.replay_buffer), **vars(default.policy), **vars(default.policy.options), **vars(default)}
+    found |= {"train_freq": written["train_freq"], "n_blocks": 12}
+    assert {key: found[key] for key in written} == written
 
 
 def nonzero_gradients(module):

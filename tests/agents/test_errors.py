@@ -14,7 +14,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from experiments.attacks.inputs import wrong_arguments
-from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr import EqRRainbow
 from sb3_eqr.eqr_rainbow import eqr_rainbow
 from tests.models import EITHER, PAPER, all_finite
 from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv, SampledEnv
@@ -99,16 +99,30 @@ def test_vec_normalize_outside_of_the_other_wrappers(make, stacked):
     assert make(VecNormalize(VecTransposeImage(env), norm_obs=False), "CnnPolicy").learn(60)._n_updates > 0
 
 
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"policy_kwargs": {"features_extractor_class": "flatten"}}, "'flatten' with layer_norm=True.* loses information"),
+        ({"policy_kwargs": {"noisy": False}}, "exploration_final_eps"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage=True has no effect"),
+    ],
+    ids=str,
+)
+def test_arguments_that_warn(make, kwargs, message):
+    with pytest.warns(UserWarning, match=message):
+        make(ChainEnv(), **kwargs)
+
+
+def test_greedy_exploration_with_resets_does_not_warn(make):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})
+
+
 @pytest.mark.parametrize("low, high", [(10.0, 10.0), (3, 1)])
 def test_a_support_without_values(low, high):
     with pytest.raises(ValueError, match=f"v_min must be a finite number < v_max = {high}, got {low}"):
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"v_min": low, "v_max": high})
-
-
-@EITHER
-def test_a_layer_norm_of_the_observations_warns(make):
-    with pytest.warns(UserWarning, match="'flatten' with layer_norm=True.* loses information"):
-        make(ChainEnv(), policy_kwargs={"features_extractor_class": "flatten"})
 
 
 def test_observations_that_are_not_a_frame_stack(make):
@@ -243,14 +257,6 @@ def test_setting_n_steps_beyond_the_buffer_raises(make):
         model.train(1, 8)
 
 
-def test_greedy_exploration_warns_without_resets(make):
-    with pytest.warns(UserWarning, match="exploration_final_eps"):
-        make(ChainEnv(), policy_kwargs={"noisy": False})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        make(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})
-
-
 class ScriptedRewards(ChainEnv):
     def __init__(self, rewards):
         super().__init__()
@@ -354,8 +360,3 @@ def test_devices(make):
 def test_every_error_names_the_wrong_argument():
     found = wrong_arguments()
     assert found.holds, found.details
-
-
-def test_an_argument_without_effect_warns():
-    with pytest.warns(UserWarning, match="optimize_memory_usage=True has no effect"):
-        EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=100, optimize_memory_usage=True)

@@ -224,6 +224,9 @@ def test_when_resets_happen(make):
     assert model._resets.done == [12, 24, 36, 48, 60, 72, 84]  # after 84, 16 are left; after 96, 4
     within_rounds = make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)
     assert within_rounds._resets.done == [7, 14, 21, 28, 35, 42, 49]
+    postponed = make(ChainEnv(), resets={"interval": 30}).learn(60)  # it is due in the last tenth of the call of learn
+    assert (postponed._n_updates, postponed._resets.done) == (40, [])
+    assert postponed.learn(40, reset_num_timesteps=False)._resets.done == [40, 70]
 
 
 def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
@@ -235,14 +238,6 @@ def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
     assert model._n_updates == 4 and model._resets.done == [4]
     model.learn(30, reset_num_timesteps=False)
     assert model._n_updates > 4
-
-
-def test_resets_are_postponed_to_the_next_call_of_learn():
-    """A reset due in the last tenth of a call of ``learn`` is done in the next call."""
-    model = make_rainbow(ChainEnv(), resets={"interval": 30}).learn(60)
-    assert (model._n_updates, model._resets.done) == (40, [])
-    model.learn(40, reset_num_timesteps=False)
-    assert model._resets.done == [40, 70]
 
 
 def test_resets_do_not_change_frozen_parameters():

@@ -249,10 +249,8 @@ def test_the_agents_reject_each_others_files(tmp_path):
 
 
 def test_parameters_for_another_support(tmp_path):
-    kwargs = {"buffer_size": 100, "device": "cpu"}
-    model = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs)
-    model.save(tmp_path / "model")
-    other = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs, policy_kwargs={"v_max": 100.0})
+    MAKERS[1](ChainEnv()).save(tmp_path / "model")
+    other = MAKERS[1](ChainEnv(), policy_kwargs={"v_max": 100.0})
     with pytest.raises(ValueError, match=r"support: .* for '\[-10.0, 100.0\]', got parameters for '\[-10.0, 10.0\]'"):
         other.set_parameters(str(tmp_path / "model"))
     other.save(tmp_path / "other")
@@ -368,12 +366,10 @@ def test_loading_executes_no_code(make, model, tmp_path, monkeypatch):
 
 
 def test_files_that_are_not_replay_buffers_of_this_package(make, model, tmp_path):
-    stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
-    stock.save_replay_buffer(tmp_path / "stock")
-    images = make(ImageEnv(), "CnnPolicy")
-    images.save_replay_buffer(tmp_path / "images")
-    other_kind = EqRRainbow if make.algorithm is EqRQRDQN else EqRQRDQN
-    other_kind("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "relative")
+    QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "stock")
+    make(ImageEnv(), "CnnPolicy").save_replay_buffer(tmp_path / "images")
+    relative = next(maker for maker in MAKERS if maker is not make)
+    relative(ChainEnv()).save_replay_buffer(tmp_path / "relative")
     for name in ("stock", "images", "relative"):
         with pytest.raises(ValueError, match=r"must be a (complete )?replay buffer"):
             model.load_replay_buffer(tmp_path / name, trust=True)

@@ -96,7 +96,10 @@ def test_keys_of_observations_must_have_the_same_order(make, tmp_path):
         make(other, "MultiInputPolicy").load_representation(tmp_path / "old")
 
 
-def test_a_different_kind_of_file(tmp_path):
+def test_files_that_are_not_agents(tmp_path):
+    (tmp_path / "cut.zip").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="must be a complete file"):
+        QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
     StockQRDQN("MlpPolicy", ChainEnv(), device="cpu").save(tmp_path / "stock")
     with pytest.raises(ValueError, match="must be a file of EqRQRDQN or EqRRainbow"):
         QRDQN(ChainEnv()).load_representation(tmp_path / "stock")
@@ -116,18 +119,12 @@ def test_frozen_networks_can_be_unfrozen(make, frozen, tmp_path):
     assert not same(before, states(model))
 
 
-def test_files_that_are_not_agents(tmp_path):
-    (tmp_path / "cut.zip").write_bytes(b"PK")
-    with pytest.raises(ValueError, match="must be a complete file"):
-        QRDQN(ChainEnv()).load_representation(tmp_path / "cut")
-    with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
-        QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation(tmp_path / "cut", freeze=True)
-
-
 def test_a_frozen_representation_needs_a_loss_that_uses_it(frozen):
     frozen.td_coef = frozen.reward_coef = 0.0
     with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
         frozen.learn(46)
+    with pytest.raises(ValueError, match="td_coef must be > 0 with a frozen representation"):
+        QRDQN(ChainEnv(), td_coef=0.0, reward_coef=0.0).load_representation("nothing", freeze=True)
 
 
 def test_a_group_given_as_an_object_is_compared_with_its_parameterization(tmp_path):

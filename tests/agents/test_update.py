@@ -171,7 +171,8 @@ def test_replay_weights_multiply_every_loss(make):
 
 def test_the_loss_is_the_weighted_mean_of_its_terms(make):
     model = trained_model(make, td_coef=2.0, aet_coef=0.5, symmetry_coef=0.25, reward_coef=3.0)
-    losses, loss, *_ = loss_terms(model, samples := model.replay_buffer.sample(8)._replace(weights=th.rand(8)))
+    samples = model.replay_buffer.sample(8)._replace(weights=th.rand(8))
+    losses, loss, *_ = loss_terms(model, samples)
     expected = 2.0 * losses["td"] + 0.5 * losses["aet"] + 0.25 * losses["symmetry"] + 3.0 * losses["reward"]
     assert min(losses[name].abs().min() for name in ("td", "aet", "symmetry")) > 0
     th.testing.assert_close(loss, (samples.weights * expected).mean())
