@@ -31,40 +31,32 @@ METRICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def aggregates_of(scores: np.ndarray) -> np.ndarray:
-    """(..., runs, games) -> (..., 4), in the order of ``METRICS``."""
-    return np.stack([function(scores) for function in METRICS.values()], axis=-1)
-
-
-def resample(*matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> list[np.ndarray]:
+def resample(matrix: np.ndarray, reps: int, seed: int = 0) -> np.ndarray:
     """
-    :param matrices: (runs, games, ...), of one agent each; resampled independently of each other
+    :param matrix: (runs, games, ...)
     :param reps: number of bootstrap samples
     :param seed: seed for NumPy's global generator, which rliable always uses; its state is restored afterwards
-    :return: (reps, runs, games, ...) each
+    :return: (reps, runs, games, ...)
     """
-    kind = library.StratifiedBootstrap if len(matrices) == 1 else library.StratifiedIndependentBootstrap
     state = np.random.get_state()
     np.random.seed(seed)
     try:
-        samples = [arrays for arrays, _ in kind(*matrices).bootstrap(reps)]
+        return np.stack([sample for (sample,), _ in library.StratifiedBootstrap(matrix).bootstrap(reps)])
     finally:
         np.random.set_state(state)
-    return [np.stack(drawn) for drawn in zip(*samples, strict=True)]
 
 
-def estimate(function: Callable[..., np.ndarray], *matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
+def estimate(function: Callable[[np.ndarray], np.ndarray], matrix: np.ndarray, reps: int, seed: int = 0) -> Estimate:
     """
-    :param function: maps arrays (..., runs, games) to (...) or (..., n)
-    :param matrices: (runs, games, ...), of one agent each
+    :param function: maps arrays (..., runs, games, ...) to (...) or (..., n)
+    :param matrix: (runs, games, ...)
     :param reps: number of bootstrap samples
     :param seed: seed of the bootstrap
     """
-    value = function(*matrices)
-    if min(map(len, matrices)) < 2:
+    value = function(matrix)
+    if len(matrix) < 2:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
-    ends = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2
-    low, high = np.quantile(function(*resample(*matrices, reps=reps, seed=seed)), ends, axis=0)
+    low, high = np.quantile(function(resample(matrix, reps, seed)), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     return value, low, high
 
 
@@ -74,15 +66,13 @@ def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
     :return: agent -> (runs, games), games in alphabetical order
     :raises ValueError: if an agent's number of runs differs between games
     """
-    games = sorted(scores["game"].unique())
     matrices = {}
     for agent, rows in scores.groupby("agent", sort=False):
-        runs = rows.groupby("game")["seed"].nunique().reindex(games, fill_value=0)
-        if runs.nunique() != 1:
-            counts = ", ".join(f"{game}: {count}" for game, count in runs.items())
+        table = rows.pivot(index="seed", columns="game", values="score").reindex(columns=sorted(scores["game"].unique()))
+        if table.isna().any(axis=None):
+            counts = ", ".join(f"{game}: {count}" for game, count in table.count().items())
             raise ValueError(f"{agent} must have the same number of runs on every game, got {counts}.")
-        columns = [rows[rows["game"] == game].sort_values("seed")["score"].to_numpy() for game in games]
-        matrices[str(agent)] = np.stack(columns, axis=1)
+        matrices[str(agent)] = np.ascontiguousarray(table)
     return matrices
 
 
@@ -91,10 +81,14 @@ def aggregate(matrices: Mapping[str, np.ndarray], reps: int = REPS, seed: int = 
     :param matrices: agent -> (runs, games), normalised scores
     :return: columns agent, metric, value, low, high
     """
+
+    def all_metrics(scores: np.ndarray) -> np.ndarray:
+        return np.stack([function(scores) for function in METRICS.values()], axis=-1)
+
     rows = [
         (agent, *row)
         for agent, matrix in matrices.items()
-        for row in zip(METRICS, *estimate(aggregates_of, matrix, reps=reps, seed=seed), strict=True)
+        for row in zip(METRICS, *estimate(all_metrics, matrix, reps, seed), strict=True)
     ]
     return pd.DataFrame(rows, columns=["agent", "metric", "value", "low", "high"])
 
@@ -111,18 +105,18 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
     def fractions(scores: np.ndarray) -> np.ndarray:
         return np.stack([(scores > threshold).mean(axis=(-2, -1)) for threshold in thresholds], axis=-1)
 
-    return estimate(fractions, matrix, reps=reps, seed=seed)
+    return estimate(fractions, matrix, reps, seed)
 
 
-def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
+def sample_efficiency(curves: np.ndarray, reps: int = REPS) -> Estimate:
     """
     :param curves: (runs, games, points), normalised scores of the evaluations during training
     :return: IQM, low, high: (points,) each
     """
-    return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps=reps, seed=seed)
+    return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps)
 
 
-def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS, seed: int = 0) -> float:
+def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS) -> float:
     """
     The smallest difference between the IQMs of two agents that their runs can detect: half the width of the 95 % interval
     around a difference of 0. It uses the bootstrap's variances times n / (n - 1), because a bootstrap of n runs
@@ -135,13 +129,12 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
     """
     if min(len(first), len(second)) < 2:
         return np.nan
-    samples = [iqm(resample(matrix, reps=reps, seed=seed)[0]) for matrix in (first, second)]
-    variance = sum(np.var(s) * len(m) / (len(m) - 1) for s, m in zip(samples, (first, second), strict=True))
+    variance = sum(np.var(iqm(resample(matrix, reps))) * len(matrix) / (len(matrix) - 1) for matrix in (first, second))
     freedom = first.shape[1] * (len(first) + len(second) - 2)
     return float(student.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(variance))
 
 
-def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
+def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS) -> pd.DataFrame:
     """
     :param matrices: agent -> (runs, games), normalised scores
     :param baseline: the agent that the others are compared with
@@ -157,19 +150,33 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
             "baseline_runs": len(other),
             "games": matrix.shape[1],
             "difference": iqm(matrix) - iqm(other),
-            "detectable": detectable_difference(matrix, other, reps, seed)
-            if min(len(matrix), len(other)) >= MIN_RUNS
-            else np.nan,
+            "detectable": detectable_difference(matrix, other, reps) if min(len(matrix), len(other)) >= MIN_RUNS else np.nan,
         }
         for agent, matrix in matrices.items()
         if agent != baseline
     )
 
 
-def games_above(matrix: np.ndarray, bound: float = 1.0) -> int:
+def distinct_best(matrices: Mapping[str, np.ndarray], reps: int) -> str | None:
+    """
+    :param matrices: agent -> (runs, games), normalised scores
+    :return: the agent with the highest IQM, if these runs distinguish it from every other one
+    """
+    if len(matrices) < 2 or min(map(len, matrices.values())) < MIN_RUNS:
+        return None
+    best = max(matrices, key=lambda agent: float(iqm(matrices[agent])))
+    is_distinct = all(
+        iqm(matrices[best]) - iqm(matrix) > detectable_difference(matrices[best], matrix, reps)
+        for agent, matrix in matrices.items()
+        if agent != best
+    )
+    return best if is_distinct else None
+
+
+def games_above(matrix: np.ndarray) -> int:
     """
     :param matrix: (runs, games), normalised scores
-    :param bound: 1 is the human score where scores are human-normalised, for the "superhuman games" of the EqR paper's tables
-    :return: number of games whose mean over runs is above the bound
+    :return: number of games whose mean over runs is above 1, which is the human score where scores are human-normalised: the
+        "superhuman games" of the EqR paper's tables
     """
-    return int((matrix.mean(axis=0) > bound).sum())
+    return int((matrix.mean(axis=0) > 1).sum())
