@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_eqr.benchmark import selection
 from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import PUBLISHED_STEPS
 from sb3_eqr.benchmark.scores import final_score, normalised, read_runs
-from sb3_eqr.benchmark.selection import (
-    choose_runs,
-    learns_latent_model,
-    never_learn,
-    protocol_differences,
-    settings_differences,
-)
 from sb3_eqr.benchmark.statistics import METRICS
 from sb3_eqr.benchmark.suites import RAW, Suite, nearest_name
 
@@ -110,17 +104,17 @@ def compare(
     finished = {folder: [row for row in rows if "stopped_at" not in row] for folder, (_, rows) in found.items()}
     results = _select(finished, [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
-    games, chosen, notes = choose_runs(results, [game for suite in suites for game in suite.games], force)
+    games, chosen, notes = selection.choose_runs(results, [game for suite in suites for game in suite.games], force)
     if baseline is not None and baseline not in chosen:
         raise ValueError(f"--baseline must be one of {', '.join(chosen)}, got {baseline!r}.")
-    with_eqr = {row["agent"] for row in results if learns_latent_model(row)}
+    with_eqr = {row["agent"] for row in results if selection.learns_latent_model(row)}
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent in with_eqr, agent))
     used = [row for row in results if row["game"] in games and row["seed"] in chosen[row["agent"]]]
     used.sort(key=lambda row: (agents.index(row["agent"]), games.index(row["game"]), row["seed"]))
     if stopped := sum(len(rows) - len(finished[folder]) for folder, (_, rows) in found.items()):
         notes.append(f"{stopped} runs were stopped before their end and are left out.")
-    notes += [*never_learn(used), *settings_differences(used)]
-    differing = protocol_differences(used)
+    notes += [*selection.never_learn(used), *selection.settings_differences(used)]
+    differing = selection.protocol_differences(used)
     if differing and not force:
         raise ValueError(
             "The protocol must be the same for every run of a game, got "
@@ -159,26 +153,23 @@ def _select(finished: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[
     :param agents: the agents to keep; empty: all
     :raises ValueError: for a folder or an agent without finished runs, or a run that is in two folders
     """
-    where: dict[tuple, pathlib.Path] = {}
     for folder, rows in finished.items():
         if not rows:
             raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
-        for row in rows:
-            if agents and row["agent"] not in agents:
-                continue
-            run = (row["agent"], row["game"], row["seed"])
-            if run in where:
-                raise ValueError(
-                    f"{run[0]}, {run[1]}, seed {run[2]} must be in one folder, got it in {where[run]} and {folder}. "
-                    "Report only one of them."
-                )
-            if not any(evaluation["kind"] == "final" and evaluation["scores"] for evaluation in row["evaluations"]):
-                raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]} must have a final evaluation, got none.")
-            where[run] = folder
     there = {row["agent"] for rows in finished.values() for row in rows}
-    if missing := [agent for agent in agents if agent not in there]:
-        raise ValueError(f"--agents: {missing[0]!r} has no finished run.{nearest_name(missing[0], there)}")
-    return [row for rows in finished.values() for row in rows if not agents or row["agent"] in agents]
+    for agent in agents:
+        if agent not in there:
+            raise ValueError(f"--agents: {agent!r} has no finished run.{nearest_name(agent, there)}")
+    kept = [(folder, row) for folder, rows in finished.items() for row in rows if not agents or row["agent"] in agents]
+    where: dict[str, pathlib.Path] = {}
+    for folder, row in kept:
+        run = f"{row['agent']}, {row['game']}, seed {row['seed']}"
+        if run in where:
+            raise ValueError(f"{run} must be in one folder, got it in {where[run]} and {folder}. Report only one of them.")
+        if not any(part["kind"] == "final" and part["scores"] for part in row["evaluations"]):
+            raise ValueError(f"{folder}: {run} must have a final evaluation, got none.")
+        where[run] = folder
+    return [row for _, row in kept]
 
 
 def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
@@ -200,10 +191,11 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
                     f"The bounds of {game} must be the same in all folders, got {low} and {high} in "
                     f"{suite.name} and {bounds[game]} before. Correct suite.yml."
                 )
-    if missing := [result["game"] for result in results if result["game"] not in bounds]:
-        raise ValueError(
-            f"{missing[0]} has no bounds for normalisation in {first.name}, which has them for "
-            f"{', '.join(bounds) or 'no game'}. "
-            "Correct the name, or add the game under normalisation: scores in suite.yml."
-        )
+    for result in results:
+        if result["game"] not in bounds:
+            raise ValueError(
+                f"{result['game']} has no bounds for normalisation in {first.name}, which has them for "
+                f"{', '.join(bounds) or 'no game'}. "
+                "Correct the name, or add the game under normalisation: scores in suite.yml."
+            )
     return bounds

@@ -9,7 +9,7 @@ import pathlib
 import re
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
 from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, read_suite
@@ -19,10 +19,8 @@ SUFFIX = ".jsonl.xz"
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
 
 
-class Checked(BaseModel):
+class Checked(BaseModel, strict=True):
     """A model that rejects values of another type; more keys are legal."""
-
-    model_config = ConfigDict(strict=True)
 
 
 class Evaluated(Checked):

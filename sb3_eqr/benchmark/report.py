@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+import pandas as pd
 
 from sb3_eqr.benchmark.analysis import all_of, analyse, conclusion, counted, notes, table_notes
 from sb3_eqr.benchmark.comparison import Comparison, compare
@@ -127,10 +128,9 @@ def _side_by_side(comparison: Comparison, settings: Callable[[dict[str, Any]], d
         found = flatten(settings(run)).items()
         return {key: value if isinstance(value, str) else json.dumps(value) for key, value in found}
 
-    by_agent = {comparison.label(agent): list(map(texts, comparison.runs(agent))) for agent in comparison.agents}
-    rows = []
-    for key in dict.fromkeys(key for runs in by_agent.values() for run in runs for key in run):
-        rows.append([key, *(" / ".join(dict.fromkeys(run.get(key, "–") for run in runs)) for runs in by_agent.values())])
-    if len(by_agent) > 1 and all(len(set(row[1:])) == 1 for row in rows):
-        return make_table(["setting", "all agents"], [row[:2] for row in rows])
-    return make_table(["setting", *by_agent], rows)
+    labels = [comparison.label(run["agent"]) for run in comparison.results]
+    table = pd.DataFrame([texts(run) for run in comparison.results]).fillna("–")
+    table = table.groupby(labels, sort=False).agg(lambda found: " / ".join(found.unique())).T
+    if len(table.columns) > 1 and (table.nunique(axis=1) == 1).all():
+        table = table.iloc[:, :1].set_axis(["all agents"], axis=1)
+    return make_table(["setting", *table], [[key, *row] for key, row in zip(table.index, table.to_numpy(), strict=True)])

@@ -1,7 +1,8 @@
 """
 Aggregate scores as rliable defines them (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264), each with its 95 % interval.
 rliable draws the bootstrap samples; aggregating all of them at once takes a hundredth of the time of rliable's loop. The
-intervals of a single run are NaN.
+intervals of a single run are NaN. A matrix, (runs, games), holds the normalised scores of an agent, and ``matrices`` are
+agent -> matrix.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,6 +17,7 @@ CONFIDENCE = 0.95
 MIN_RUNS = 3  # for a verdict: two runs hardly show how much scores differ by chance
 REPS = 2_000  # bootstrap samples, stratified by game, as for rliable's profiles
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]  # value, low, high
+Matrices = Mapping[str, np.ndarray]
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
@@ -32,14 +34,9 @@ METRICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def resample(matrix: np.ndarray, reps: int, seed: int = 0) -> np.ndarray:
-    """
-    :param matrix: (runs, games, ...)
-    :param reps: number of bootstrap samples
-    :param seed: seed for NumPy's global generator, which rliable always uses; its state is restored afterwards
-    :return: (reps, runs, games, ...)
-    """
+    """(runs, games, ...) -> (reps, runs, games, ...): bootstrap samples."""
     state = np.random.get_state()
-    np.random.seed(seed)
+    np.random.seed(seed)  # rliable always uses the global generator
     try:
         return np.stack([sample for (sample,), _ in library.StratifiedBootstrap(matrix).bootstrap(reps)])
     finally:
@@ -50,8 +47,6 @@ def estimate(function: Callable[[np.ndarray], np.ndarray], matrix: np.ndarray, r
     """
     :param function: maps arrays (..., runs, games, ...) to (...) or (..., n)
     :param matrix: (runs, games, ...)
-    :param reps: number of bootstrap samples
-    :param seed: seed of the bootstrap
     """
     value = function(matrix)
     if len(matrix) < 2:
@@ -76,20 +71,16 @@ def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
     return matrices
 
 
-def aggregate(matrices: Mapping[str, np.ndarray], reps: int = REPS, seed: int = 0) -> pd.DataFrame:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :return: columns agent, metric, value, low, high
-    """
+def aggregate(matrices: Matrices, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
+    """:return: columns agent, metric, value, low, high"""
 
     def all_metrics(scores: np.ndarray) -> np.ndarray:
         return np.stack([function(scores) for function in METRICS.values()], axis=-1)
 
-    rows = [
-        (agent, *row)
-        for agent, matrix in matrices.items()
-        for row in zip(METRICS, *estimate(all_metrics, matrix, reps, seed), strict=True)
-    ]
+    found = {
+        agent: zip(METRICS, *estimate(all_metrics, matrix, reps, seed), strict=True) for agent, matrix in matrices.items()
+    }
+    rows = [(agent, *row) for agent, rows in found.items() for row in rows]
     return pd.DataFrame(rows, columns=["agent", "metric", "value", "low", "high"])
 
 
@@ -97,7 +88,6 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
     """
     The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 of EqR).
 
-    :param matrix: (runs, games), normalised scores
     :param thresholds: (n,), in the unit of the scores
     :return: (n,) each, with pointwise intervals
     """
@@ -123,8 +113,6 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
     underestimates them by that factor, and Student's quantile with games (n₁ + n₂ - 2) degrees of freedom. Without both
     corrections, 2 runs on 3 games would distinguish identical agents in a fifth of all cases.
 
-    :param first: (runs, games), normalised scores
-    :param second: (runs, games), where the number of runs may differ from the first's
     :return: the difference in the unit of the scores; NaN if either agent has a single run, whose spread is unknown
     """
     if min(len(first), len(second)) < 2:
@@ -134,9 +122,8 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
     return float(student.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(variance))
 
 
-def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS) -> pd.DataFrame:
+def iqm_differences(matrices: Matrices, baseline: str, reps: int = REPS) -> pd.DataFrame:
     """
-    :param matrices: agent -> (runs, games), normalised scores
     :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, runs, baseline_runs, games, difference (of the IQMs, agent - baseline), detectable
         (see :func:`detectable_difference`; NaN for fewer than ``MIN_RUNS`` runs)
@@ -157,11 +144,8 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
     )
 
 
-def distinct_best(matrices: Mapping[str, np.ndarray], reps: int) -> str | None:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :return: the agent with the highest IQM, if these runs distinguish it from every other one
-    """
+def distinct_best(matrices: Matrices, reps: int) -> str | None:
+    """:return: the agent with the highest IQM, if these runs distinguish it from every other one"""
     if len(matrices) < 2 or min(map(len, matrices.values())) < MIN_RUNS:
         return None
     best = max(matrices, key=lambda agent: float(iqm(matrices[agent])))
@@ -174,9 +158,5 @@ def distinct_best(matrices: Mapping[str, np.ndarray], reps: int) -> str | None:
 
 
 def games_above(matrix: np.ndarray) -> int:
-    """
-    :param matrix: (runs, games), normalised scores
-    :return: number of games whose mean over runs is above 1, which is the human score where scores are human-normalised: the
-        "superhuman games" of the EqR paper's tables
-    """
+    """:return: number of games whose mean is above 1: the "superhuman games" of the EqR paper, if 1 is the human score"""
     return int((matrix.mean(axis=0) > 1).sum())
