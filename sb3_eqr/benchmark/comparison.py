@@ -161,13 +161,14 @@ def _select(finished: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[
         if agent not in there:
             raise ValueError(f"--agents: {agent!r} has no finished run.{nearest_name(agent, there)}")
     kept = [(folder, row) for folder, rows in finished.items() for row in rows if not agents or row["agent"] in agents]
-    where: dict[str, pathlib.Path] = {}
+    where: dict[tuple, pathlib.Path] = {}
     for folder, row in kept:
-        run = f"{row['agent']}, {row['game']}, seed {row['seed']}"
+        run = (row["agent"], row["game"], row["seed"])
+        name = f"{run[0]}, {run[1]}, seed {run[2]}"
         if run in where:
-            raise ValueError(f"{run} must be in one folder, got it in {where[run]} and {folder}. Report only one of them.")
+            raise ValueError(f"{name} must be in one folder, got it in {where[run]} and {folder}. Report only one of them.")
         if not any(part["kind"] == "final" and part["scores"] for part in row["evaluations"]):
-            raise ValueError(f"{folder}: {run} must have a final evaluation, got none.")
+            raise ValueError(f"{folder}: {name} must have a final evaluation, got none.")
         where[run] = folder
     return [row for _, row in kept]
 

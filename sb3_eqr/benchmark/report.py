@@ -128,7 +128,7 @@ def _side_by_side(comparison: Comparison, settings: Callable[[dict[str, Any]], d
         found = flatten(settings(run)).items()
         return {key: value if isinstance(value, str) else json.dumps(value) for key, value in found}
 
-    labels = [comparison.label(run["agent"]) for run in comparison.results]
+    labels = np.array([comparison.label(run["agent"]) for run in comparison.results])
     table = pd.DataFrame([texts(run) for run in comparison.results]).fillna("–")
     table = table.groupby(labels, sort=False).agg(lambda found: " / ".join(found.unique())).T
     if len(table.columns) > 1 and (table.nunique(axis=1) == 1).all():

@@ -80,7 +80,7 @@ def game_table(
     A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below. In bold are agents
     that these runs distinguish from all others with the same protocol.
 
-    :param matrices: see :class:`~sb3_eqr.benchmark.analysis.Analysis`, as for ``means``, ``aggregates`` and ``reps``
+    ``matrices``, ``means``, ``aggregates`` and ``reps`` are those of :class:`~sb3_eqr.benchmark.analysis.Analysis`.
     """
     names = (RANDOM, HUMAN) if comparison.human else () if comparison.is_raw else ("score 0", "score 1")
     header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
