@@ -18,37 +18,13 @@ from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.trust import wrapper_names
-from sb3_eqr.zoo.checks import fail
+from sb3_eqr.zoo.checks import fail, failing
 
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
 # Arguments that RL Zoo itself passes to the constructor, and their flags.
-FLAGS = {
-    "env": "--env",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
-    "tensorboard_log": "--tensorboard-log",
-    "_init_setup_model": "nothing",
-}
-
-
-def is_text_of_number(value: Any) -> bool:
-    """Whether the value is a number that was read as text, as YAML reads 1e5."""
-    try:
-        return isinstance(value, str) and np.isfinite(float(value))
-    except ValueError:
-        return False
-
-
-def is_schedule(value: Any) -> bool:
-    """Whether RL Zoo converts the value to a schedule: "lin_1e-3" decreases linearly to 0."""
-    try:
-        return isinstance(value, str) and value.startswith("lin_") and float(value.removeprefix("lin_")) >= 0
-    except ValueError:
-        return False
-
-
+FLAGS = {key: f"--{key.replace('_', '-')}" for key in ("env", "seed", "device", "verbose", "tensorboard_log")}
+FLAGS["_init_setup_model"] = "nothing"
 SMALLEST_IMAGE = 36  # pixels: what the convolutions of the "default-image" entries need
 # Values that RL Zoo itself reads.
 RULES = {
@@ -58,8 +34,17 @@ RULES = {
     "learning_starts": number(0) | NONE,
     "buffer_size": number(1),
     "normalize": FLAG | TEXT | DICTIONARY,
-    "learning_rate": number(0) | Rule("lin_ and a number", is_schedule),
+    # RL Zoo converts "lin_1e-3" to a schedule that decreases linearly to 0.
+    "learning_rate": number(0) | Rule("lin_ and a number", lambda value: number_in(value, "lin_") >= 0),
 }
+
+
+def number_in(value: Any, start: str = "") -> float:
+    """The number in a text that begins with ``start``; NaN if the value is no such text."""
+    try:
+        return float(value.removeprefix(start)) if isinstance(value, str) and value.startswith(start) else np.nan
+    except ValueError:
+        return np.nan
 
 
 def read_file(path: str) -> dict[str, Any]:
@@ -103,12 +88,10 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
         return "atari"
     if not any(name.startswith("default-") for name in entries):
         return "default"
-    try:
+    with failing(f"{env_id}: ", (ValueError, TypeError, ImportError, AttributeError)):
         env = gym.make(env_id, **(changes.get("env_kwargs") or {}))
         wrap = get_wrapper_class(changes) if changes.get("env_wrapper") else None
         space = (env if wrap is None else wrap(env)).observation_space
-    except (ValueError, TypeError, ImportError, AttributeError) as error:
-        fail(f"{env_id}: {error}")
     env.close()
     if isinstance(space, gym.spaces.Dict):
         return "default-dict"
@@ -181,7 +164,7 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
 def check_values(entry: dict[str, Any], source: str) -> None:
     """Exit with a message if a value is a number that was read as text, or if RL Zoo cannot use it."""
     for key, value in entry.items():
-        if is_text_of_number(value):
+        if np.isfinite(number_in(value)):  # as YAML reads 1e5
             written = np.format_float_positional(float(value), trim="-")
             fail(
                 f"{source}: {key} must be a number, got the text {value!r}, which YAML does not read as one: write {written}."
