@@ -40,11 +40,7 @@ def register() -> None:
 
 
 def import_packages(packages: Iterable[str]) -> None:
-    """
-    Import packages that register environments with gymnasium.
-
-    :raises ValueError: if a package cannot be imported
-    """
+    """Import packages that register environments with gymnasium; raises ValueError if one cannot be imported."""
     for package in packages:
         try:
             importlib.import_module(package)

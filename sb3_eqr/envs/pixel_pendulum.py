@@ -93,6 +93,3 @@ class PixelPendulum(PixelEnv):
         nearest = np.clip(rows * along[0] + columns * along[1], 0, 0.4 * self.size)
         distance = np.hypot(rows - nearest * along[0], columns - nearest * along[1])
         return np.rint(255 * np.clip(self.size / 24 + 0.5 - distance, 0, 1)).astype(np.uint8)
-
-    def _picture(self) -> np.ndarray:
-        return self._rod(self.angle)[:, :, None].repeat(3, axis=2)

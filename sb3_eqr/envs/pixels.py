@@ -16,7 +16,7 @@ ENLARGED = 4  # scale factor from an observation to a rendered image
 class PixelEnv(gym.Env):
     """
     An environment whose observation is a small image, and whose ``info`` holds the true state. A subclass defines how an
-    episode begins, what an action does, and what is seen; its description lists the actions and the options of ``reset``.
+    episode begins, what an action does, and what is seen; its docstring lists the actions and the options of ``reset``.
 
     :param size: height and width of the image, in pixels; at least 36
     :param channels: number of channels of the observation
@@ -83,15 +83,14 @@ class PixelEnv(gym.Env):
         raise NotImplementedError
 
     def _picture(self) -> np.ndarray:
-        """What ``render`` enlarges: (size, size, 3), uint8."""
-        raise NotImplementedError
+        """What ``render`` enlarges, (size, size, 3), uint8: the observation, if it has colours, or its last channel."""
+        observation, _ = self._seen()
+        return observation if observation.shape[2] == 3 else observation[:, :, -1:].repeat(3, axis=2)
 
 
 def check_position(name: str, position: Sequence[float] | np.ndarray, dimensions: int) -> np.ndarray:
     """
-    :param name: name of the argument
     :param position: fractions of a closed loop, one per axis
-    :param dimensions: number of axes
     :return: a copy, (dimensions,)
     :raises ValueError: if ``position`` is not ``dimensions`` numbers in [0, 1)
     """

@@ -114,7 +114,7 @@ class SlidingBall(PixelEnv):
         return np.hypot(rows[:, None], columns[None, :])
 
     def _picture(self) -> np.ndarray:
-        picture = self.draw(self.position).repeat(3, axis=2)
+        picture = super()._picture()
         if self.goal is not None:
             ring = np.clip(1.5 - np.abs(self._distance(self.goal) - self.size / 8), 0, 1)
             picture[:, :, 1] = np.maximum(picture[:, :, 1], np.rint(110 * ring).astype(np.uint8))

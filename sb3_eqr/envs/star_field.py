@@ -87,9 +87,6 @@ class StarField(PixelEnv):
         info = {"rotation": self.rotation.copy(), "translation": self.translation.copy()}
         return self.draw(self.rotation, self.translation), info
 
-    def _picture(self) -> np.ndarray:
-        return self.draw(self.rotation, self.translation)
-
     def draw(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """
         :param rotation: right, down and forward axis of the camera in world coordinates, as columns, (3, 3)
@@ -121,11 +118,7 @@ class StarField(PixelEnv):
 
 
 def axis_rotation(axis: int, angle: float) -> np.ndarray:
-    """
-    :param axis: 0, 1 or 2
-    :param angle: in radians, right-handed
-    :return: the rotation about that axis, (3, 3)
-    """
+    """:return: the right-handed rotation about axis 0, 1 or 2 by an angle in radians, (3, 3)"""
     about_first = np.array([[1, 0, 0], [0, cos(angle), -sin(angle)], [0, sin(angle), cos(angle)]])
     return np.roll(about_first, axis, axis=(0, 1))
 
@@ -155,7 +148,6 @@ def orthonormalized(matrix: np.ndarray) -> np.ndarray:
 
 def check_rotation(rotation: Any) -> np.ndarray:
     """
-    :param rotation: value of the option
     :return: a copy, (3, 3)
     :raises ValueError: if it is not a rotation matrix to six digits
     """

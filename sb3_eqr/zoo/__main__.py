@@ -51,7 +51,6 @@ push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothi
 
 def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
     """
-    :param algo: value of ``--algo``
     :param conf_file: value of ``--conf-file``: a path, or the name of one of our files
     :return: the file to use; ``None``: RL Zoo's
     """
@@ -73,10 +72,7 @@ def own_parser() -> argparse.ArgumentParser:
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
-    """
-    :param arguments: arguments of ``train`` or of a command that loads an agent
-    :return: the arguments checked here; RL Zoo parses all arguments again
-    """
+    """:return: the arguments that are checked here; RL Zoo parses all arguments again"""
     parser = argparse.ArgumentParser(add_help=False, parents=[own_parser()])
     parser.add_argument("--algo")
     parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
@@ -102,12 +98,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def prepare_training(args: argparse.Namespace) -> str | None:
-    """
-    Check all arguments before RL Zoo starts.
-
-    :param args: arguments of ``train``
-    :return: the file of hyperparameters to use; ``None``: RL Zoo's
-    """
+    """Check the arguments of ``train``. Returns the file of hyperparameters to use; ``None``: RL Zoo's."""
     algo = args.algo or "ppo"
     path = find_hyperparameters(algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
@@ -212,10 +203,7 @@ def save_where_nothing_is_shown(command: str) -> None:
 
 
 def run(command: str, arguments: list[str]) -> None:
-    """
-    :param command: one of ``COMMANDS``
-    :param arguments: RL Zoo's command-line arguments
-    """
+    """Run a command of RL Zoo with these arguments."""
     sys.argv = [f"sb3-eqr {command}", *arguments]
     module = f"rl_zoo3.plots.{command}" if command in PLOTS else f"rl_zoo3.{command}"
     try:

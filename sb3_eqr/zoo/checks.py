@@ -26,12 +26,7 @@ def fail(message: str) -> NoReturn:
 
 @contextmanager
 def failing(start: str = "", errors: tuple[type[Exception], ...] = (ValueError,)) -> Iterator[None]:
-    """
-    Exit with the message of an error instead of raising it.
-
-    :param start: start of the message
-    :param errors: the errors
-    """
+    """Exit with ``start`` and the message of an error instead of raising it."""
     try:
         yield
     except errors as error:

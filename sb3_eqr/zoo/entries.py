@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import inspect
 import pathlib
+import runpy
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, T
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from sb3_eqr.envs.pixels import SMALLEST_PICTURE
 from sb3_eqr.trust import wrapper_names
 from sb3_eqr.zoo.checks import fail, failing
 
@@ -25,7 +27,6 @@ ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "cal
 # Arguments that RL Zoo itself passes to the constructor, and their flags.
 FLAGS = {key: f"--{key.replace('_', '-')}" for key in ("env", "seed", "device", "verbose", "tensorboard_log")}
 FLAGS["_init_setup_model"] = "nothing"
-SMALLEST_IMAGE = 36  # pixels: what the convolutions of the "default-image" entries need
 # Values that RL Zoo itself reads.
 RULES = {
     "n_timesteps": number(0, above=True),
@@ -57,17 +58,12 @@ def read_file(path: str) -> dict[str, Any]:
             names = ", ".join(configuration_files())
             fail(f"--conf-file must be a YAML file, a Python file or package, or one of {names}, got {path!r}.")
         return importlib.import_module(path).hyperparams
-    file = pathlib.Path(path)
-    if not file.is_file():
+    if not pathlib.Path(path).is_file():
         fail(f"--conf-file: there is no file {path!r}.{nearest(path, configuration_files())}")
     if path.endswith(".py"):
-        found: dict[str, Any] = {}
-        exec(file.read_text(encoding="utf-8"), found)
-        return found["hyperparams"]
-    try:
-        entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        fail(f"{path} must be valid YAML: {error}")
+        return runpy.run_path(path)["hyperparams"]
+    with failing(f"{path} must be valid YAML: ", (yaml.YAMLError,)):
+        entries = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8")) or {}
     if not isinstance(entries, dict):
         fail(f"{path} must be a mapping from environments to entries, got {entries!r:.60}.")
     return entries
@@ -76,7 +72,6 @@ def read_file(path: str) -> dict[str, Any]:
 def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) -> str:
     """
     :param entries: entries of a file
-    :param env_id: the environment
     :param changes: changes of the entry, which may wrap the environment
     :return: its own name, "atari", or that of a generic entry: "default", or "default-image", "default-small-image" or
         "default-dict" if the file has them and the observations are images or dicts (RL Zoo itself knows only "default");
@@ -97,13 +92,11 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
         return "default-dict"
     if not is_image_space(space):
         return "default"
-    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_IMAGE else "default-image"
+    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_PICTURE else "default-image"
 
 
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
     """
-    :param path: path of the file
-    :param env_id: the environment
     :param changes: changes from the command line
     :return: the entry as in the file, with the changes; exits with a message if there is none
     """
@@ -133,11 +126,10 @@ def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
 
 def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     """
-    Exit with a message if a key is not an argument of the constructor, or a wrapper does not work with our agents.
+    Exit with a message if a key is not an argument of the constructor, or a value or wrapper does not work.
 
     :param entry: hyperparameters for one environment
-    :param algo: the algorithm
-    :param source: where the hyperparameters are from, for messages
+    :param source: where they are from, for messages
     """
     algorithm = ALGOS[algo]
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))

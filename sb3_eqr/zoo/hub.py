@@ -21,9 +21,7 @@ REPLACED = {
 
 
 def correct_card(folder: str | pathlib.Path) -> None:
-    """
-    :param folder: folder with a model card by RL Zoo, which gets commands that know our agents
-    """
+    """In the model card that RL Zoo has written into a folder, use commands that know our agents."""
     card = pathlib.Path(folder) / "README.md"
     text = card.read_text(encoding="utf-8")
     for old, new in REPLACED.items():
@@ -72,11 +70,8 @@ def generate_metadata(*args: Any) -> dict[str, Any]:
 
 def load_from_hub(repo_id: str, filename: str) -> str:
     """
-    :param repo_id: id of the repository
-    :param filename: name of the file in it
-    :return: path of the downloaded file
-    :raises requests.HTTPError: if there is no such file; RL Zoo 2.9 expects it for models without normalisation, but current
-        versions of huggingface_hub raise another error (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252)
+    As huggingface_sb3's, but raises ``requests.HTTPError`` if there is no such file. RL Zoo 2.9 expects it for models without
+    normalisation; current versions of huggingface_hub raise another (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252).
     """
     try:
         return DOWNLOAD(repo_id, filename)
@@ -85,11 +80,7 @@ def load_from_hub(repo_id: str, filename: str) -> str:
 
 
 def prepare(dry_run: bool) -> None:
-    """
-    Patch what RL Zoo's ``push_to_hub`` and ``load_from_hub`` use.
-
-    :param dry_run: whether to only build the folder
-    """
+    """Patch what RL Zoo's ``push_to_hub``, which only builds the folder if ``dry_run``, and ``load_from_hub`` use."""
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
     importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
     huggingface_sb3.load_from_hub = load_from_hub

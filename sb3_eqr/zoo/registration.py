@@ -13,19 +13,14 @@ NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 
 def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
     """
-    :param sampled: sampled values, with the names of :func:`sample_eqr_params`
+    :param sampled: values by the names of :func:`sample_eqr_params`
     :param kept: ``policy_kwargs`` that are not searched, which RL Zoo would drop
     :return: keyword arguments of the agent
     """
     params = dict(sampled)
     batch_size, train_freq = 2 ** params.pop("batch_size_pow"), 2 ** params.pop("train_freq_pow")
-    policy_kwargs: dict[str, Any] = {
-        **kept,
-        "group": params.pop("group"),
-        "n_blocks": params.pop("n_blocks"),
-        "net_arch": NET_ARCHS[params.pop("net_arch")],
-        "noisy": params.pop("noisy"),
-    }
+    policy_kwargs = {**kept, **{name: params.pop(name) for name in ("group", "n_blocks", "net_arch", "noisy")}}
+    policy_kwargs["net_arch"] = NET_ARCHS[policy_kwargs["net_arch"]]
     if "return_range" in params:
         policy_kwargs["v_max"] = float(params.pop("return_range"))
         policy_kwargs["v_min"] = -policy_kwargs["v_max"]
@@ -91,11 +86,5 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
 def trust_files(algo: str) -> None:
     """Make RL Zoo, which cannot pass ``trust``, load the files of an agent with it: its own classes are then imported."""
     kind = AGENTS[algo]
-
-    class Trusting(kind):  # type: ignore[valid-type, misc]
-        @classmethod
-        def load(cls, *args: Any, **kwargs: Any) -> Any:
-            return super().load(*args, **{**kwargs, "trust": True})
-
-    Trusting.__name__ = kind.__name__  # saved with its files
-    ALGOS[algo] = Trusting
+    load = partial(kind.load, trust=True)
+    ALGOS[algo] = type(kind.__name__, (kind,), {"load": staticmethod(load)})  # files hold the name
