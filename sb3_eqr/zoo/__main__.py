@@ -25,7 +25,7 @@ from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 from sb3_eqr.zoo.registration import trust_files
 from sb3_eqr.zoo.resuming import ResumableExperiment, checkpoints_of, config_of
 
-# RL Zoo's modules of these names: most have a function of that name, too, and scripts have none.
+# Each command is a module of RL Zoo with a function of the same name, or a script.
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
 SCRIPTS = ("record_video", "push_to_hub", "load_from_hub")
 COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
@@ -150,8 +150,9 @@ def prepare_resuming(args: argparse.Namespace) -> list[str]:
         with failing("--resume: "):
             _, manifest = read_manifest(checkpoints_of(args.resume))
         seed = manifest["settings"].get("seed")
-    options = {name: getattr(args, name) for name in ("checkpoint_every", "resume", "trust")}
-    train.ExperimentManager = partial(ResumableExperiment, **options)  # type: ignore[misc, assignment]
+    train.ExperimentManager = partial(  # type: ignore[misc, assignment]
+        ResumableExperiment, checkpoint_every=args.checkpoint_every, resume=args.resume, trust=args.trust
+    )
     return [] if seed is None else ["--seed", str(seed)]  # RL Zoo shows and stores it, and would draw one
 
 

@@ -1,4 +1,4 @@
-"""For the Hugging Face Hub: a dry run, and a model card with our commands."""
+"""Additions to RL Zoo for the Hugging Face Hub: a dry run, and a model card with our commands."""
 
 import importlib
 import os
