@@ -5,9 +5,8 @@ import shutil
 from collections.abc import Sequence
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
-from rl_zoo3 import train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -31,15 +30,18 @@ class RngPreserving(EventCallback):
 
 
 class ResumableExperiment(ExperimentManager):
-    """RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``."""
+    """
+    RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``.
 
-    checkpoint_every: ClassVar[int | None] = None
-    resume: ClassVar[pathlib.Path | None] = None
-    trust: ClassVar[bool] = False
+    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
+    :param resume: a run's folder, or a folder of checkpoints; ``None``: a new run
+    :param trust: as in ``load``
+    """
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    def __init__(self, *args: Any, checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.continue_training = self.continue_training or self.resume is not None
+        self.checkpoint_every, self.resume, self.trust = checkpoint_every, resume, trust
+        self.continue_training = self.continue_training or resume is not None
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """As RL Zoo's; exits with a message instead of a traceback if the experiment cannot be built."""
@@ -87,7 +89,7 @@ def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
 
 def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> dict[str, Any] | None:
     """
-    :param path: as ``resume`` in :func:`install`, or one checkpoint
+    :param path: a run's folder, a folder of checkpoints, or one checkpoint
     :param trust: whether the settings may name code of any package
     :param packages: packages whose code they may name in any case
     :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
@@ -102,17 +104,3 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
             entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
             return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
     return None
-
-
-def install(checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool) -> None:
-    """
-    Make ``rl_zoo3.train`` use this experiment. Options are class attributes, because its parser knows only its own arguments.
-
-    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
-    :param resume: a run's folder, or a folder of checkpoints
-    :param trust: as in ``load``
-    """
-    ResumableExperiment.checkpoint_every = checkpoint_every
-    ResumableExperiment.resume = resume
-    ResumableExperiment.trust = trust
-    train.ExperimentManager = ResumableExperiment  # type: ignore[misc]
