@@ -139,7 +139,7 @@ def _is_harmless(name: str) -> bool:
         return False
     if not (isinstance(found, type) and issubclass(found, (gym.Wrapper, VecEnvWrapper))):
         return False
-    return found.__module__.startswith(WRAPPERS) and not any(part in found.__name__ for part in WRITING)
+    return f"{found.__module__}.".startswith(WRAPPERS) and not any(part in found.__name__ for part in WRITING)
 
 
 def wrapper_names(wrappers: Any) -> list[str]:

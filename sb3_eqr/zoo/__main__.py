@@ -1,6 +1,7 @@
 """The command line: thin wrappers of RL Zoo's functions."""
 
 import argparse
+import errno
 import importlib
 import pathlib
 import runpy
@@ -32,7 +33,8 @@ COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 ALL_COMMANDS = (*COMMANDS, "benchmark", "visualize")
 LOADING = ("enjoy", "record_video", "push_to_hub")
 # Errors of RL Zoo that may have a cause which the user can remove.
-MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, FileNotFoundError)
+MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, OSError)
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 
 # Packages of the extra "zoo".
@@ -162,8 +164,10 @@ def check_runs(arguments: list[str]) -> None:
     for flags in (("-a", "--algos"), ("-e", "--env"), ("-f", "--exp-folders")):
         parser.add_argument(*flags, nargs="+", default=[])
     args = parser.parse_known_args(arguments)[0]
+    if not (args.algos and args.env and args.exp_folders):
+        fail("all_plots needs -a ALGO ..., -e ENV ... and -f FOLDER ..., the folder given to train.")
     places = [pathlib.Path(folder) / algo for folder in args.exp_folders for algo in args.algos]
-    if args.env and places and not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
+    if not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
         fail(f"all_plots needs runs on {', '.join(args.env)} in {', '.join(map(str, places))}, got none.")
 
 
@@ -226,6 +230,8 @@ def explanation(command: str, error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         return f"{command}: {error}.{advice}"
+    if isinstance(error, OSError) and error.errno in UNWRITABLE:
+        return f"{command}: {error}. Free some space, or pass another folder with -f."
     if "pass trust=True" in str(error) or str(error).startswith("observation_space"):
         return f"{command}: {error}"
     if isinstance(error, gym.error.DependencyNotInstalled):

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 import huggingface_hub
 import huggingface_sb3
 import requests
+import wasabi
 
 from sb3_eqr.common.saving.files import temporary_folder
 
@@ -82,6 +83,8 @@ def load_from_hub(repo_id: str, filename: str) -> str:
 def prepare(dry_run: bool) -> None:
     """Patch what RL Zoo's ``push_to_hub``, which only builds the folder if ``dry_run``, and ``load_from_hub`` use."""
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
+    if dry_run:
+        wasabi.Printer.info = lambda *_: None  # type: ignore[method-assign] # RL Zoo says that it pushes
     importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
     huggingface_sb3.load_from_hub = load_from_hub
     provide_ffmpeg()
