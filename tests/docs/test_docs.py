@@ -8,6 +8,7 @@ Nothing else is replaced.
 """
 
 import argparse
+import ast
 import importlib
 import json
 import os
@@ -18,6 +19,7 @@ import shlex
 import subprocess
 import sys
 import warnings
+from types import SimpleNamespace
 
 import huggingface_hub
 import huggingface_sb3
@@ -25,6 +27,7 @@ import matplotlib
 import pytest
 import stable_baselines3.common.evaluation
 import yaml
+from sphinx.directives.code import LiteralIncludeReader
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -37,17 +40,19 @@ import sb3_eqr.zoo.__main__ as zoo_command
 import sb3_eqr.zoo.hub
 from sb3_eqr import ExactCheckpointCallback, cli
 from sb3_eqr.benchmark.agents import find_agent
-from sb3_eqr.benchmark.suites import choose, load_suite, make_suite, write_suite
+from sb3_eqr.benchmark.suites import choose, load_suite, make_suite
 from sb3_eqr.zoo.entries import check_entry
+from tests.tools.test_report import a_benchmark
 
 ROOT = pathlib.Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(set(DOCS.rglob("*.md")) - set((DOCS / "_build").rglob("*")))]
 STEPS, LEARNING_STARTS, TRAIN_FREQ, GRADIENT_STEPS, ROLLOUT, GAME_STEPS = 20, 16, 4, 2, 8, 40
-
-
+INCLUDE_OPTIONS = {"pyobject", "start-at", "end-before", "dedent"}  # line numbers go stale
 SHELL = ("git", "cd", ".")
-CPU_BUILD = ("torch==2.13.0", "--index-url", "https://download.pytorch.org/whl/cpu")  # of install.md
+# Of another version than the tested one, ``pip install -c constraints.txt`` would replace the CPU build by the one with CUDA.
+(TESTED,) = re.findall(r"^torch==.+$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.M)
+CPU_BUILD = (TESTED, "--index-url", "https://download.pytorch.org/whl/cpu")
 
 
 def name_of(page):
@@ -71,8 +76,8 @@ def check_yaml(example):
             check_entry(entry, "eqr_rainbow" if "rainbow" in example.path else "eqr_qrdqn", "docs")
 
 
-def check_text(example):
-    """Output, folders, drawings: not checked."""
+def check_nothing(example):
+    """Output, folders, drawings."""
 
 
 def check_eval_rst(example):
@@ -86,7 +91,12 @@ def check_eval_rst(example):
 
 
 def check_literalinclude(example):
-    """Checked by test_includes.py."""
+    """What it shows is a complete function or statement. Read with Sphinx's own reader."""
+    options = dict(re.findall(r"^:([\w-]+): *(.*)$", example.parsed, re.M))
+    assert options.keys() <= INCLUDE_OPTIONS
+    options |= {key: int(options[key]) for key in options.keys() & {"dedent"}}
+    code, _ = LiteralIncludeReader(str(included(example)), options, SimpleNamespace(source_encoding="utf-8")).read()
+    assert ast.parse(code).body
 
 
 def check_pages(example):
@@ -98,19 +108,19 @@ def check_pages(example):
 
 
 def check_include(example):
-    assert (pathlib.Path(example.path).parent / argument(example)).is_file()
+    assert included(example).is_file()
 
 
-def argument(example):
-    return example.region.lexemes["info"].split("}")[1].strip()
+def included(example):
+    return pathlib.Path(example.path).parent / example.region.lexemes["info"].split("}")[1].strip()
 
 
 BLOCKS = {
     "python": PythonEvaluator(),
     "sh": check_sh,
     "yaml": check_yaml,
-    "text": check_text,
-    "": check_text,
+    "text": check_nothing,
+    "": check_nothing,
     "{eval-rst}": check_eval_rst,
     "{literalinclude}": check_literalinclude,
     "{toctree}": check_pages,
@@ -278,21 +288,7 @@ def shortened(monkeypatch, tmp_path):
     monkeypatch.setattr(stable_baselines3.common.evaluation, "evaluate_policy", evaluate_one)
     monkeypatch.setattr(sb3_eqr.envs.atari, "MAX_STEPS", GAME_STEPS)
     monkeypatch.chdir(tmp_path)
-    write_a_benchmark(tmp_path / "results" / "smoke")
-
-
-def write_a_benchmark(folder):
-    """One finished run, with the fields that a report reads."""
-    suite = load_suite("smoke")
-    evaluation = {"kind": "final", "step": 3_000, "scores": [475.0], "lengths": [475]}
-    training = {"step": [100], "score": [100.0], "length": [100]}
-    names = {"agent": "eqr_qrdqn", "game": "CartPole-v1", "seed": 0, "suite": "smoke", "command": "", "started": "today"}
-    others = {"protocol": suite.protocol("CartPole-v1"), "entry": {}, "losses": [], "resumed_at": [], "machine": {}}
-    others |= {"attempts": 1, "wall_clock_s": 1.0, "steps_per_second": 1.0}
-    run = folder / "runs" / "eqr_qrdqn" / "CartPole-v1" / "0"
-    run.mkdir(parents=True)
-    write_suite(suite, folder / "suite.yml")
-    (run / "result.json").write_text(json.dumps({**names, **others, "evaluations": [evaluation], "training": training}))
+    a_benchmark(tmp_path / "results" / "smoke", {"eqr_qrdqn": {"CartPole-v1": [475.0]}}, load_suite("smoke"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

@@ -29,6 +29,7 @@ from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 
 STEPS = 160
+OFTEN = Settings(checkpoint_seconds=0.0)
 SHARED = "policy: MlpPolicy\n  n_timesteps: 1000\n  policy_kwargs: {net_arch: [16]}\n"
 OFF_POLICY = "  learning_starts: 40\n  batch_size: 8\n  train_freq: 8\n  gradient_steps: 2\n  buffer_size: 100\n"
 NORMALISED = "  normalize: {norm_obs: true, norm_reward: true}\n"
@@ -42,15 +43,8 @@ AGENTS = {
 
 
 def protocol(steps=STEPS, env_id="CartPole-v1", epsilon=0.0, n_envs=2, max_steps=40, points=4):
-    curve = {"points": points, "episodes": 3}
-    evaluation = {
-        "episodes": 5,
-        "n_envs": n_envs,
-        "epsilon": epsilon,
-        "max_steps": max_steps,
-        "preprocessing": {},
-        "curve": curve,
-    }
+    evaluation = {"episodes": 5, "n_envs": n_envs, "epsilon": epsilon, "max_steps": max_steps, "preprocessing": {}}
+    evaluation["curve"] = {"points": points, "episodes": 3}
     return {"env_id": env_id, "steps": steps, "preprocessing": {}, "evaluation": evaluation}
 
 
@@ -69,25 +63,25 @@ def scores_of(run):
     return result["evaluations"], result["training"]
 
 
-def stop_at(monkeypatch, *steps):
-    """Training stops with an exception when it first reaches each of these steps."""
-    ahead = list(steps)
+def interrupt(run, step, settings=OFTEN):
+    """Execute the run until an exception at a step."""
     on_step = training.RunCallback._on_step
 
     def step_or_stop(self):
-        if ahead and self.num_timesteps >= ahead[0]:
-            raise KeyError(f"stopped at {ahead.pop(0)}")
+        if self.num_timesteps >= step:
+            raise KeyError(f"stopped at {step}")
         return on_step(self)
 
-    monkeypatch.setattr(training.RunCallback, "_on_step", step_or_stop)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyError, match="stopped at"):
+        patch.setattr(training.RunCallback, "_on_step", step_or_stop)
+        execute(run, settings)
 
 
 def test_environments_of_a_package(tmp_path, monkeypatch):
     """Registered when the package is imported, in the process of the run; a package that is missing is named."""
-    (tmp_path / "grid_package.py").write_text(
-        "import gymnasium\nfrom gymnasium.envs.classic_control import CartPoleEnv\n"
-        "gymnasium.register('OwnPole-v0', CartPoleEnv, max_episode_steps=40)\n"
-    )
+    pole = "gymnasium.envs.classic_control:CartPoleEnv"
+    code = f"import gymnasium\ngymnasium.register('OwnPole-v0', '{pole}', max_episode_steps=40)"
+    (tmp_path / "grid_package.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     run = make_run(tmp_path, "dqn", game="OwnPole-v0")
     try:
@@ -100,35 +94,27 @@ def test_environments_of_a_package(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("algo", AGENTS)
-def test_an_interrupted_run_has_the_scores_of_an_uninterrupted_one(algo, tmp_path, monkeypatch):
-    undisturbed = make_run(tmp_path / "undisturbed", algo)
+def test_an_interrupted_run_has_the_scores_of_an_uninterrupted_one(algo, tmp_path):
+    undisturbed, stopped = make_run(tmp_path / "undisturbed", algo), make_run(tmp_path / "stopped", algo)
     assert execute(undisturbed, Settings()) == "finished"
-    stopped = make_run(tmp_path / "stopped", algo)
-    often = Settings(checkpoint_seconds=0.0)
-    stop_at(monkeypatch, 70, 130)
-    for _ in range(2):
-        with pytest.raises(KeyError, match="stopped at"):
-            execute(stopped, often)
+    for step in (70, 130):
+        interrupt(stopped, step)
         assert "stopped at" in (stopped.folder / ERROR).read_text() and len(find_checkpoints(stopped.folder)) == 1
-    assert execute(stopped, often) == "finished"
+    assert execute(stopped, OFTEN) == "finished"
     assert scores_of(stopped) == scores_of(undisturbed)
     result = result_of(stopped)
     assert result["attempts"] == 3 and result["resumed_exactly"]
     assert 0 < result["resumed_at"][0] < 70 < result["resumed_at"][1] < 130
     assert sorted(path.name for path in stopped.folder.iterdir()) == [LOCK, RESULT]
-    assert execute(stopped, often) == "finished"
+    assert execute(stopped, OFTEN) == "finished"
 
 
 def test_the_contents_of_the_result(tmp_path):
     run = make_run(tmp_path, "eqr_rainbow", points=4, command="sb3-eqr benchmark run x")
     execute(run, Settings())
     result = result_of(run)
-    assert [(row["step"], row["kind"], len(row["scores"])) for row in result["evaluations"]] == [
-        (40, "curve", 3),
-        (80, "curve", 3),
-        (120, "curve", 3),
-        (160, "final", 5),
-    ]
+    found = [(row["step"], row["kind"], len(row["scores"])) for row in result["evaluations"]]
+    assert found == [(40, "curve", 3), (80, "curve", 3), (120, "curve", 3), (160, "final", 5)]
     training = result["training"]
     assert training["step"] == np.cumsum(training["length"]).tolist() and training["step"][-1] <= STEPS
     assert training["score"] == training["length"]  # raw scores of CartPole, although the agent learns from normalised rewards
@@ -139,12 +125,10 @@ def test_the_contents_of_the_result(tmp_path):
     assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "td_state_gradient", "step"} <= result["losses"][-1].keys()
 
 
-def test_saved_models_are_the_evaluated_agents_in_the_format_of_rl_zoo(tmp_path, monkeypatch):
+def test_saved_models_are_the_evaluated_agents_in_the_format_of_rl_zoo(tmp_path):
     """With the normalisation of the observations; an interrupted run leaves no second copy."""
     run, settings = make_run(tmp_path, "dqn", command="made by"), Settings(save_models=True)
-    stop_at(monkeypatch, STEPS // 2)
-    with pytest.raises(KeyError):
-        execute(run, settings)
+    interrupt(run, STEPS // 2, settings)
     execute(run, settings)
     assert sorted(path.name for path in run.folder.iterdir()) == [LOCK, "models", RESULT]
     folder = run.folder / "models" / "dqn" / "CartPole-v1_1"
@@ -203,10 +187,8 @@ class Fixed:
 
 
 @pytest.fixture
-def corridor(monkeypatch):
-    spec = gym.envs.registration.EnvSpec("Corridor-v0", entry_point=Corridor)
-    monkeypatch.setitem(gym.registry, "Corridor-v0", spec)
-    return "Corridor-v0"
+def corridor(register):
+    return register("Corridor-v0", Corridor)
 
 
 def test_short_episodes_are_not_counted_more_often(corridor):
@@ -274,7 +256,7 @@ def test_a_full_disk_stops_the_run_and_keeps_its_last_checkpoint(tmp_path, monke
 
     monkeypatch.setattr(training, "write_checkpoint", no_space_at_the_fifth)
     with monkeypatch.context(), pytest.raises(OSError, match="No space left"):
-        execute(full, Settings(checkpoint_seconds=0.0))
+        execute(full, OFTEN)
     assert [path.name for path in full.folder.glob("*checkpoint*")] == [f"checkpoint-{calls[3]:012d}"]
     monkeypatch.undo()
     execute(full, Settings())
@@ -309,42 +291,29 @@ def test_an_endless_atari_game_is_counted_at_the_step_limit(monkeypatch):
 
 
 @pytest.mark.parametrize("normalize", [{"norm_obs": False}, {"norm_obs_keys": ["vec"]}, {}], ids=str)
-def test_evaluation_normalises_what_training_did(normalize):
+def test_evaluation_normalises_what_training_did(register, normalize):
     class Trained(Fixed):
         def get_vec_normalize_env(self):
             return trained
 
-    same = lambda: np.random.seed(0) or SimpleMultiObsEnv(channel_last=False, random_start=False)  # noqa: E731
-    gym.register("Multi-v0", same)  # its constructor draws the observations
-    protocol = {"env_id": "Multi-v0", "preprocessing": {}, "evaluation": {"n_envs": 1, "max_steps": None, "preprocessing": {}}}
+    def same():
+        np.random.seed(0)  # the constructor draws the observations
+        return SimpleMultiObsEnv(channel_last=False, random_start=False)
+
+    register("Multi-v0", same)
     trained = VecNormalize(make_vec_env("Multi-v0", seed=3), **{"norm_obs_keys": ["vec"], **normalize})
     trained.reset()
     trained.step(np.array([1]))
-    env = make_evaluation_env(protocol, Trained(), seed=4)
+    env = make_evaluation_env(protocol(env_id="Multi-v0", n_envs=1, max_steps=None), Trained(), seed=4)
     plain = make_vec_env("Multi-v0", seed=4)
     assert np.array_equal(env.reset()["vec"], trained.normalize_obs(plain.reset())["vec"])
-    del gym.registry["Multi-v0"]
 
 
-def test_evaluation_has_the_wrapper_of_the_vectorised_environment():
-    wrapper = "stable_baselines3.common.vec_env.VecExtractDictObs"
-    gym.register("Multi-v0", lambda: SimpleMultiObsEnv(channel_last=False))
-    protocol = {"env_id": "Multi-v0", "preprocessing": {"vec_env_wrapper": [{wrapper: {"key": "vec"}}]}}
-    protocol["evaluation"] = {"n_envs": 1, "max_steps": None, "preprocessing": {}}
-    assert make_evaluation_env(protocol, Fixed(), seed=4).observation_space.shape == (5,)
-    del gym.registry["Multi-v0"]
-
-
-class Watching(Fixed):
-    """An agent that records the observations it was given."""
-
-    def __init__(self):
-        self.seen = []
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        assert observation.shape[1:] == (84, 84, 4) and episode_start.shape == (len(observation),)
-        self.seen += [one.tobytes() for one in observation]
-        return super().predict(observation, state, episode_start, deterministic)
+def test_evaluation_has_the_wrapper_of_the_vectorised_environment(register):
+    wrapper = {"stable_baselines3.common.vec_env.VecExtractDictObs": {"key": "vec"}}
+    given = protocol(env_id=register("Multi-v0", lambda: SimpleMultiObsEnv(channel_last=False)), max_steps=None)
+    given["preprocessing"] = {"vec_env_wrapper": [wrapper]}
+    assert make_evaluation_env(given, Fixed(), seed=4).observation_space.shape == (5,)
 
 
 def test_scores_and_lengths_of_atari_are_those_of_full_games():
@@ -354,13 +323,6 @@ def test_scores_and_lengths_of_atari_are_those_of_full_games():
     assert len(scores) == len(lengths) == 3 and len(set(lengths)) > 1
     assert all(100 < length < 500 for length in lengths) and 0 < sum(scores) < 50
     assert (np.random.get_state()[1] == state).all()
-
-
-def test_the_seed_determines_the_atari_games_that_are_played():
-    agents = [Watching() for _ in range(3)]
-    for agent, seed in zip(agents, (0, 0, 1), strict=True):
-        evaluate(agent, atari_protocol("Breakout", n_envs=1, epsilon=1.0, max_steps=15), 1, seed=seed)
-    assert agents[0].seen == agents[1].seen != agents[2].seen
 
 
 def test_atari_games_are_saved_in_the_middle():
@@ -403,17 +365,11 @@ def timeout_of_the_last(checkpoint, run, folder, done, timeout):
 def test_box2d_resumes_with_a_new_episode_and_reports_it(tmp_path, monkeypatch):
     """LunarLander cannot be saved in the middle of an episode."""
     run = make_run(tmp_path, "dqn", game="LunarLander-v3", steps=300)
-    stop_at(monkeypatch, 100)
-    with pytest.raises(KeyError):
-        execute(run, Settings(checkpoint_seconds=0.0))
+    interrupt(run, 100)
     ends = [(1, 0), (1, 1), (0, 0)]  # done and time-out of the last transition: only what has not ended is cut here
     assert [timeout_of_the_last(find_checkpoints(run.folder)[-1], run, tmp_path, *end) for end in ends] == [0, 1, 1]
-    counts = []
-    monkeypatch.setattr(
-        training.RunCallback,
-        "_on_training_start",
-        lambda self: counts.append(self.model.get_vec_normalize_env().obs_rms.count),
-    )
+    counts, count = [], lambda self: counts.append(self.model.get_vec_normalize_env().obs_rms.count)
+    monkeypatch.setattr(training.RunCallback, "_on_training_start", count)
     monkeypatch.setattr(training.RunCallback, "note_progress", lambda self: None)
     execute(run, Settings())
     assert counts == [pytest.approx(96, abs=10)]  # the statistics of observations are restored
@@ -491,25 +447,20 @@ def test_two_commands_can_plan_games_in_one_folder(tmp_path, monkeypatch):
 
 def test_an_agent_with_a_class_of_its_own_resumes(tmp_path, monkeypatch):
     """Its checkpoint holds a pickle of the class, which the entry has already run."""
-    (tmp_path / "my_extractor.py").write_text(
-        "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
-    )
+    code = "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
+    (tmp_path / "my_extractor.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     own = "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_extractor').Mine)"
     entry = f'{{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, policy_kwargs: "{own}"}}'
     run = make_run(tmp_path, "eqr_qrdqn", entry)
-    stop_at(monkeypatch, 100)
-    with pytest.raises(KeyError, match="stopped at"):
-        execute(run, Settings(checkpoint_seconds=0.0))
+    interrupt(run, 100)
     assert execute(run, Settings()) == "finished" and result_of(run)["resumed_exactly"]
 
 
-def test_the_noise_of_gsde_is_not_restored(tmp_path, monkeypatch):
+def test_the_noise_of_gsde_is_not_restored(tmp_path):
     entry = "{policy: MlpPolicy, n_timesteps: 1000, n_steps: 32, batch_size: 8, n_epochs: 1, use_sde: true}"
     run = make_run(tmp_path, "ppo", entry, game="Pendulum-v1")
-    stop_at(monkeypatch, 100)
-    with pytest.raises(KeyError, match="stopped at"):
-        execute(run, Settings(checkpoint_seconds=0.0))
+    interrupt(run, 100)
     execute(run, Settings())
     assert not result_of(run)["resumed_exactly"]
 

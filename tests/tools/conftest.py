@@ -1,0 +1,37 @@
+"""Fixtures for tests of the command line and of environments that have an id."""
+
+import sys
+
+import gymnasium as gym
+import pytest
+
+from sb3_eqr import cli
+
+
+@pytest.fixture
+def sb3_eqr(monkeypatch, capfd):
+    """Runs a command line, which must exit with ``code``, and returns what it prints, (out, err)."""
+
+    def call(line, code=0):
+        monkeypatch.setattr(sys, "argv", ["sb3-eqr", *line.split()])
+        try:
+            cli.main()
+            left = 0
+        except SystemExit as stopped:
+            left = stopped.code
+        shown = capfd.readouterr()
+        assert left == code, shown
+        return shown
+
+    return call
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Registers an environment until the end of the test, and returns its id."""
+
+    def call(env_id, make):
+        monkeypatch.setitem(gym.registry, env_id, gym.envs.registration.EnvSpec(env_id, entry_point=make))
+        return env_id
+
+    return call
