@@ -49,6 +49,19 @@ class Protocol(Checked):
     evaluation: Evaluation
 
 
+class Entry(Checked):
+    """The agent."""
+
+    algo: str
+    hyperparameters: dict[str, Any]
+
+
+class Machine(Checked):
+    """What it was trained on."""
+
+    threads: PositiveInt
+
+
 class Row(Checked):
     """What a report needs of a run; rows have more."""
 
@@ -57,10 +70,10 @@ class Row(Checked):
     seed: NonNegativeInt
     suite: str
     protocol: Protocol
-    entry: dict[str, Any]
+    entry: Entry
     command: str
     started: str
-    machine: dict[str, Any]
+    machine: Machine
     attempts: NonNegativeInt
     wall_clock_s: FiniteFloat
     steps_per_second: FiniteFloat
