@@ -13,3 +13,7 @@ def main() -> None:
     from sb3_eqr import cli
 
     cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -23,6 +23,7 @@ from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.trust import check_zoo_folder, read_plain
 from sb3_eqr.zoo.checks import fail
+from sb3_eqr.zoo.entries import read_entry
 
 FOLDER = "checkpoints"  # in the folder of a run
 
@@ -65,7 +66,7 @@ class ResumableExperiment(ExperimentManager):
             self._remove_folder()
             raise
         if found is not None and isinstance(found[0], EqRAlgorithm):
-            print(f"{in_one_line(found[0])}, by {self.config}. Without it, {type(found[0]).__name__} has other defaults.")
+            print(f"{in_one_line(found[0])}. The defaults of {type(found[0]).__name__} in Python may differ.")
         return found
 
     def _remove_folder(self) -> None:
@@ -85,7 +86,9 @@ class ResumableExperiment(ExperimentManager):
         finally:
             self._remove_folder()
         if self.algo in AGENTS and self.best[1]:
-            print(f"As hyperparameters in a YAML file:\n{yaml.safe_dump(HYPERPARAMS_CONVERTER[self.algo](self.best[1]))}")
+            env_id = self.env_name.gym_id
+            found = {**read_entry(str(self.config), env_id, {}), **HYPERPARAMS_CONVERTER[self.algo](self.best[1])}
+            print(f"As a file for --conf-file:\n{yaml.safe_dump({env_id: found})}")
 
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""

@@ -284,7 +284,7 @@ def test_a_signal_to_end_saves_the_agent_and_one_before_training_leaves_no_folde
     line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 900 -params learning_starts:100 --eval-freq -1 -f {tmp_path}"
     monkeypatch.setattr(EqRQRDQN, "train", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
     shown = sb3_eqr(line)
-    assert "EqRQRDQN: SO(3)^12, euler; auxiliary losses: AET 2, by " in shown.out
+    assert "EqRQRDQN: SO(3)^12, euler; auxiliary losses: AET 2. The defaults" in shown.out
     model = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip")
     assert 100 < model.num_timesteps < 900
     monkeypatch.setattr(EqRQRDQN, "_setup_model", lambda *_: signal.raise_signal(signal.SIGTERM))
@@ -427,7 +427,8 @@ def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     line = "train --algo eqr_rainbow --env MinAtar/Breakout-v1 -n 30 --seed 1 -params learning_starts:25 buffer_size:100"
     shown = sb3_eqr(f"{line} -optimize --n-trials 1 --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}")
     assert "Number of finished trials:  1" in shown.out
-    entry = yaml.safe_load(shown.out.partition("As hyperparameters in a YAML file:")[2])
+    entry = yaml.safe_load(shown.out.partition("As a file for --conf-file:")[2])["MinAtar/Breakout-v1"]
+    assert entry["policy"] == "CnnPolicy" and "n_timesteps" in entry  # also what was not searched
     layers = {"features_extractor_kwargs": {"layers": [[16, 3, 1]]}}
     assert entry["policy_kwargs"].items() >= layers.items() and {"gamma", "gradient_steps"} <= entry.keys()
     assert [path.suffix for path in (tmp_path / "eqr_rainbow").iterdir() if path.is_dir()] == []  # no run to play

@@ -453,3 +453,12 @@ def test_arguments_out_of_range_raise(kwargs, message):
     arguments = {"buffer_size": 100, "n_steps": 3, "prediction_depth": 5, **kwargs}
     with pytest.raises(ValueError, match=message):
         PrioritizedSequenceReplayBuffer(observation_space=IMAGES, action_space=ACTIONS, device="cpu", **arguments)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_box_actions_must_be_finite(wrong):
+    buffer = SequenceReplayBuffer(20, VECTOR, FORCES, "cpu")
+    obs, zero = np.zeros((1, 3), dtype=np.float32), np.zeros(1, dtype=np.float32)
+    with pytest.raises(ValueError, match="action must be finite, got"):
+        buffer.add(obs, obs, np.array([[wrong, 0.0]]), zero, zero, [{}])
+    assert buffer.size() == 0

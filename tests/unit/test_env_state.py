@@ -199,3 +199,13 @@ def test_state_dict_must_be_plain():
 def test_the_table_names_only_known_types():
     kinds = {kind for row in ATTRIBUTES.values() for entry in row.values() for kind in entry.removesuffix("?").split("/")}
     assert kinds == {"int", "real", "bool", "array", "list", "tuple", "part"}
+
+
+def test_the_generator_of_an_environment_with_state_dict_is_restored():
+    env = make_vec_env(ChainEnv, 2, seed=3)
+    env.reset()
+    state, unknown = capture(env)
+    drawn = [one.unwrapped.np_random.random() for one in env.envs]
+    assert not unknown and [one.unwrapped.np_random.random() for one in env.envs] != drawn
+    restore(env, state, wrappers_only=False)
+    assert [one.unwrapped.np_random.random() for one in env.envs] == drawn

@@ -65,6 +65,8 @@ def check_transition(action_space: spaces.Space, obs: Any, next_obs: Any, action
                 f"{what} must be finite, got {found}. Nothing was stored. SB3's VecCheckNan shows which action caused it."
             )
     actions, n_actions = np.asarray(action), int(getattr(action_space, "n", 0))
+    if isinstance(action_space, spaces.Box) and not np.isfinite(actions).all():
+        raise ValueError(f"action must be finite, got {actions.tolist()}. Nothing was stored.")
     if n_actions and not ((actions >= 0) & (actions < n_actions)).all():  # NaN is neither
         raise ValueError(f"action must be integers in [0, {n_actions - 1}], got {actions.tolist()}. Nothing was stored.")
     dones = np.asarray(done)

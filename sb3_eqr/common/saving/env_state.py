@@ -183,8 +183,11 @@ def _name(part: Any) -> str:
 
 def _row(part: Any) -> dict[str, str] | None:
     row = ATTRIBUTES.get(_name(part))
-    is_env = isinstance(part, gym.Env) and not isinstance(part, gym.Wrapper)
-    return {**row, "np_random": "part"} if row is not None and is_env else row
+    return {**row, "np_random": "part"} if row is not None and _is_env(part) else row
+
+
+def _is_env(part: Any) -> bool:
+    return isinstance(part, gym.Env) and not isinstance(part, gym.Wrapper)
 
 
 def _is_emulator(part: Any) -> bool:
@@ -208,7 +211,8 @@ def _state_of(part: Any) -> Any:
         state = encode(part.state_dict())
         if without_pickles(state) != state:
             raise ValueError(f"{_name(part)}.state_dict must return numbers, strings, arrays and containers of these.")
-        return state
+        generator = getattr(part, "np_random", None) if _is_env(part) else None
+        return {"state": state, "np_random": _state_of(generator) if isinstance(generator, np.random.Generator) else None}
     return None
 
 
@@ -227,7 +231,9 @@ def _restore(part: Any, state: Any) -> None:
         for key in part:
             _restore(part[key], state[key])
     elif (row := _row(part)) is None:
-        part.load_state_dict(decode(state))
+        if state["np_random"] is not None:
+            _restore(part.np_random, state["np_random"])
+        part.load_state_dict(decode(state["state"]))
     else:
         _restore_attributes(part, state, row)
 
