@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -267,8 +266,6 @@ def test_invalid_arguments_raise(make, tmp_path):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
     with pytest.raises(ValueError, match="env must have the agent's observation_space"):
         record(model, ImageEnv(), tmp_path / "v")
-    with pytest.raises(ValueError, match=r"record needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which"):
-        record(DQN("MlpPolicy", ChainEnv()), ChainEnv(), tmp_path / "v")
 
 
 def test_a_frame_shows_truth_and_ghost():
@@ -340,11 +337,6 @@ def test_an_agent_without_latent_losses_warns_once(make, off):
     with pytest.warns(UserWarning, match="LatentCallback logs nothing") as told:
         trained(make, LatentCallback(log_freq=10), **off)
     assert len([warning for warning in told if "LatentCallback" in str(warning.message)]) == 1
-
-
-def test_other_agents_raise():
-    with pytest.raises(ValueError, match=r"LatentCallback needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN"):
-        DQN("MlpPolicy", ChainEnv()).learn(1, callback=LatentCallback())
 
 
 def test_spr_is_refused_at_the_start():
