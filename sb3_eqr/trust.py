@@ -18,8 +18,9 @@ WRAPPERS: tuple[str, ...] = ("sb3_eqr.envs.", "stable_baselines3.common.atari_wr
 WRAPPERS += ("sb3_contrib.common.wrappers.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
 EVALUATED = ("normalize", "policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")  # strings that RL Zoo evaluates
 IMPORTED = ("policy", "replay_buffer_class", "callback")  # names that it imports
-PLAIN = (ast.Expression, ast.Call, ast.Name, ast.Load, ast.keyword, ast.Dict, ast.List, ast.Tuple, ast.Constant, ast.UnaryOp)
-PLAIN += (ast.USub,)  # type: ignore[assignment]
+# The syntax of plain values, and calls, of which only those of dict are allowed.
+PLAIN: tuple[type[ast.AST], ...] = (ast.Expression, ast.Call, ast.Name, ast.Load, ast.keyword, ast.Dict, ast.List, ast.Tuple)
+PLAIN += (ast.Constant, ast.UnaryOp, ast.USub)
 WRITING = ("Monitor", "Record", "Video")  # parts of names
 # The only names in the statistics of VecNormalize. NumPy has moved its private modules from core to _core.
 STATISTICS = {
@@ -29,15 +30,14 @@ STATISTICS = {
     "gymnasium.spaces.discrete": ("Discrete",),
     "gymnasium.spaces.dict": ("Dict",),
     "numpy": ("ndarray", "dtype", "bool_"),
+    "numpy.random._pickle": ("__generator_ctor", "__bit_generator_ctor"),
+    "numpy.random._pcg64": ("PCG64",),
+    "numpy.random._generator": ("Generator",),
+    "numpy.random.bit_generator": ("__pyx_unpickle_SeedSequence", "SeedSequence"),
     "collections": ("OrderedDict",),
+    **{f"{core}.multiarray": ("_reconstruct", "scalar") for core in ("numpy.core", "numpy._core")},
+    **{f"{core}.numeric": ("_frombuffer",) for core in ("numpy.core", "numpy._core")},
 }
-for core in ("numpy.core", "numpy._core"):
-    STATISTICS[f"{core}.multiarray"] = ("_reconstruct", "scalar")
-    STATISTICS[f"{core}.numeric"] = ("_frombuffer",)
-STATISTICS["numpy.random._pickle"] = ("__generator_ctor", "__bit_generator_ctor")
-STATISTICS["numpy.random._pcg64"] = ("PCG64",)
-STATISTICS["numpy.random._generator"] = ("Generator",)
-STATISTICS["numpy.random.bit_generator"] = ("__pyx_unpickle_SeedSequence", "SeedSequence")
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -86,19 +86,19 @@ def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None
     """
     files = (folder / "args.yml", folder / "config.yml")
     arguments, config = (read_plain(file) if file.is_file() else {} for file in files)  # RL Zoo reads what is there
+    inside = tuple(f"{package}." for package in packages)
     package, colon, _ = str(arguments.get("env")).partition(":")
     named = [*map(str, arguments.get("gym_packages") or []), *([package] if colon else [])]
     for key in ("env_wrapper", "vec_env_wrapper"):
         named += [name for name in wrapper_names(config.get(key)) if not _is_harmless(name)]
-    named = [name for name in named if name not in packages and not name.startswith(tuple(f"{p}." for p in packages))]
+    named = [name for name in named if name not in packages and not name.startswith(inside)]
     named += [f"{key}: {config[key]}" for key in EVALUATED if isinstance(config.get(key), str) and not is_plain(config[key])]
     imported = [(key, name) for key in IMPORTED for name in wrapper_names(config.get(key)) if key != "policy" or "." in name]
-    named += [f"{key}: {name}" for key, name in imported if not name.startswith(tuple(f"{p}." for p in packages))]
+    named += [f"{key}: {name}" for key, name in imported if not name.startswith(inside)]
     if named:
-        found = ", ".join(map(str, named))
         raise ValueError(
             f"{folder} must name only packages given with --gym-packages, and wrappers of {', '.join(WRAPPERS)} that write no "
-            f"files, got {found}. {PASS_TRUST}"
+            f"files, got {', '.join(named)}. {PASS_TRUST}"
         )
     check_statistics(folder / "vecnormalize.pkl")
 
@@ -139,7 +139,7 @@ def _is_harmless(name: str) -> bool:
         return False
     if not (isinstance(found, type) and issubclass(found, (gym.Wrapper, VecEnvWrapper))):
         return False
-    return found.__module__.startswith(WRAPPERS) and not any(part in found.__name__ for part in WRITING)
+    return f"{found.__module__}.".startswith(WRAPPERS) and not any(part in found.__name__ for part in WRITING)
 
 
 def wrapper_names(wrappers: Any) -> list[str]:
@@ -148,4 +148,4 @@ def wrapper_names(wrappers: Any) -> list[str]:
         return []
     if isinstance(wrappers, (list, tuple)):
         return [name for wrapper in wrappers for name in wrapper_names(wrapper)]
-    return [str(name) for name in wrappers] if isinstance(wrappers, dict) else [str(wrappers)]
+    return [*map(str, wrappers)] if isinstance(wrappers, dict) else [str(wrappers)]

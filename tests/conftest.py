@@ -2,6 +2,7 @@ import pytest
 import torch as th
 
 from tests.models import MAKERS
+from tests.toys import ChainEnv
 
 th.set_num_threads(1)  # small networks are slower on two threads, and xdist runs two tests at once
 
@@ -18,3 +19,9 @@ def no_gpu(request, monkeypatch):
 def make(request):
     """A maker of small agents, of each algorithm in turn."""
     return request.param
+
+
+@pytest.fixture
+def model(make):
+    """A small agent after twelve updates."""
+    return make(ChainEnv()).learn(46)

@@ -2,22 +2,18 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.envs import SimpleMultiObsEnv
 from torch import nn
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from tests.toys import ChainEnv, ImageEnv
 
-SMALL = {
-    "learning_starts": 40,
-    "buffer_size": 500,
-    "batch_size": 8,
-    "n_steps": 3,
-    "prediction_depth": 2,
-    "device": "cpu",
-    "seed": 0,
-}
+SMALL = {"learning_starts": 40, "buffer_size": 500, "batch_size": 8, "n_steps": 3, "prediction_depth": 2}
+SMALL |= {"device": "cpu", "seed": 0}
 N_ATOMS = 9
 
 # policy_kwargs of the paper's network, without the changes of docs/gradients.md; PAPER_FLAT also has no trunk, for vectors.
@@ -27,6 +23,10 @@ PAPER_FLAT = {**PAPER, "features_extractor_class": "flatten"}
 # For tests that must pass with both networks.
 NETWORKS = {"default": {}, "paper": PAPER}
 BOTH = pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
+
+
+ENVS = [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv), ("MultiInputPolicy", SimpleMultiObsEnv)]
+POLICIES = pytest.mark.parametrize("policy, env", ENVS)
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,32 @@ MAKERS = [Maker(EqRQRDQN, "n_quantiles"), Maker(EqRRainbow, "n_atoms")]
 
 # For slow tests that do not depend on the head.
 EITHER = pytest.mark.parametrize("make", MAKERS[1:], indirect=True, ids=["EqRRainbow"])
+
+
+def tensors(part):
+    """Copies of the tensors of an agent, a network, a state dict or a list of parameters, by name or number."""
+    if isinstance(part, list):
+        part = dict(enumerate(part))
+    elif not isinstance(part, dict):
+        part = getattr(part, "policy", part).state_dict()
+    return {name: value.detach().clone() for name, value in part.items()}
+
+
+def same(one, other):
+    """Whether the tensors of two agents, networks, state dicts or lists of parameters are equal, bit for bit."""
+    one, other = tensors(one), tensors(other)
+    return one.keys() == other.keys() and all(th.equal(one[key], other[key]) for key in one)
+
+
+def all_finite(model):
+    """Whether all parameters of an agent are finite."""
+    return all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def draw(buffer, n, seed=0, **kwargs):
+    """Samples of a replay buffer, the same ones from buffers that should be equal."""
+    np.random.seed(seed)
+    return buffer.sample(n, **kwargs)
 
 
 def loss_terms(model, samples):

@@ -40,31 +40,6 @@ class ChainEnv(gym.Env):
         return self.observe(), self.position, terminated, self.time >= self.length and not terminated, {}
 
 
-class ImageEnv(gym.Env):
-    """Random images, channels first or last, with episodes of a fixed length."""
-
-    def __init__(self, shape=(36, 36, 1), length=7, dtype=np.uint8):
-        high = 255 if dtype == np.uint8 else 1
-        self.observation_space = spaces.Box(0, high, shape, dtype)
-        self.action_space = spaces.Discrete(3)
-        self.length, self.time = length, 0
-
-    def observe(self):
-        image = self.np_random.integers(0, 256, self.observation_space.shape)
-        if self.observation_space.dtype == np.uint8:
-            return image.astype(np.uint8)
-        return (image / 255).astype(self.observation_space.dtype)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return self.observe(), {}
-
-    def step(self, action):
-        self.time += 1
-        return self.observe(), float(action == 1), self.time % (2 * self.length) == 0, self.time == self.length, {}
-
-
 class PoisonEnv(ChainEnv):
     """Returns a bad value at a chosen step: ``where`` is "obs", "reward", "terminal" or "reset"."""
 
@@ -80,48 +55,57 @@ class PoisonEnv(ChainEnv):
         obs, reward, terminated, truncated, info = super().step(action)
         self.steps += 1
         if self.steps == self.at:
-            if self.where == "obs":
-                obs = obs * self.value
-            elif self.where == "terminal":
-                obs, terminated = obs * self.value, True
+            if self.where in ("obs", "terminal"):
+                obs, terminated = obs * self.value, terminated or self.where == "terminal"
             elif self.where == "reward":
                 reward = self.value
         return obs, reward, terminated, truncated, info
 
 
-class DictEnv(gym.Env):
-    """Random numbers under keys that are not sorted."""
+class SampledEnv(gym.Env):
+    """Samples of a space; episodes of a fixed length, every other one truncated. The reward grows to 1."""
 
-    action_space = spaces.Discrete(3)
-
-    def __init__(self, keys: tuple[str, ...] = ("velocity", "angle")):
-        self.observation_space = spaces.Dict(OrderedDict((key, spaces.Box(-1, 1, (1,))) for key in keys))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observe(), {}
+    def __init__(self, space, length=10):
+        self.observation_space, self.action_space = space, spaces.Discrete(3)
+        self.length, self.n_episodes = length, 0
 
     def observe(self):
-        return {key: self.np_random.uniform(-1, 1, 1).astype(np.float32) for key in self.observation_space}
-
-    def step(self, action):
-        return self.observe(), 0.0, False, False, {}
-
-
-class IntegerEnv(gym.Env):
-    """Integers, one of them Discrete and a Python int, as many environments return it; episodes of seven steps."""
-
-    observation_space = spaces.Dict({"count": spaces.Box(-9, 9, (2,), np.int64), "kind": spaces.Discrete(8)})
-    action_space = spaces.Discrete(2)
+        return self.observation_space.sample()
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
         self.time = 0
         return self.observe(), {}
 
-    def observe(self):
-        return {"count": self.np_random.integers(-9, 10, 2), "kind": self.time}
-
     def step(self, action):
         self.time += 1
-        return self.observe(), 1.0, self.time == 7, False, {}
+        ends = self.time == self.length
+        self.n_episodes += ends
+        truncated = ends and self.n_episodes % 2 == 1
+        return self.observe(), self.time / self.length, ends and not truncated, truncated, {}
+
+
+class ImageEnv(SampledEnv):
+    """Images, channels first or last."""
+
+    def __init__(self, shape=(36, 36, 1), length=7, dtype=np.uint8):
+        super().__init__(spaces.Box(0, 255 if dtype == np.uint8 else 1, shape, dtype), length)
+
+
+class DictEnv(SampledEnv):
+    """Numbers under keys that are not sorted."""
+
+    def __init__(self, keys: tuple[str, ...] = ("velocity", "angle")):
+        super().__init__(spaces.Dict(OrderedDict((key, spaces.Box(-1, 1, (1,))) for key in keys)))
+
+
+class IntegerEnv(SampledEnv):
+    """Integers, one of them Discrete and a Python int, as many environments return it."""
+
+    def __init__(self):
+        super().__init__(spaces.Dict({"count": spaces.Box(-9, 9, (2,), np.int64), "kind": spaces.Discrete(8)}), length=7)
+
+    def observe(self):
+        return {**super().observe(), "kind": self.time}

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,10 @@ import pandas as pd
 
 from sb3_eqr.benchmark import statistics
 from sb3_eqr.benchmark.comparison import Comparison
-from sb3_eqr.benchmark.reference import SHOWN, PublishedMethod, load_reference, published_means
+from sb3_eqr.benchmark.reference import SHOWN, load_reference, published_means
+from sb3_eqr.benchmark.scores import normalised
 from sb3_eqr.benchmark.statistics import MIN_RUNS
-from sb3_eqr.benchmark.tables import aggregate_means, distinct_best, number
+from sb3_eqr.benchmark.tables import number
 
 FEW_RUNS = 5  # with fewer, the intervals of the percentile bootstrap are far too narrow
 
@@ -22,8 +23,10 @@ class Analysis:
     """
     :param comparison: the runs compared
     :param matrices: agent or reference -> (runs, games), normalised scores, games in alphabetical order
-    :param aggregates: columns agent, metric, value, low, high
-    :param means: rows games, columns published methods, raw mean scores
+    :param means: rows games, columns published methods, raw mean scores; no columns where a run's steps differ from the
+        published methods', the suite is not normalised by human scores, or a game has no published score
+    :param aggregates: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"),
+        protocol_differs: the metrics that mean something, and the number of games above 1
     :param differences: differences of IQMs from the first agent and from the best, see
         :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
     :param reps: bootstrap samples behind all intervals
@@ -31,8 +34,8 @@ class Analysis:
 
     comparison: Comparison
     matrices: dict[str, np.ndarray]
-    aggregates: pd.DataFrame
     means: pd.DataFrame
+    aggregates: pd.DataFrame
     differences: pd.DataFrame
     reps: int
 
@@ -43,42 +46,45 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
     :param reps: number of bootstrap samples
     """
     matrices = statistics.score_matrices(comparison.scores)
+    means = published_means(SHOWN, comparison.games if comparison.has_published else [])
+    if len(means) < len(comparison.games):
+        means = pd.DataFrame(index=comparison.games)
+    parts = [_aggregates(comparison, matrices, reps).assign(**{"from": "runs"})]
+    for method in SHOWN if len(means.columns) else ():  # as of a single run with these scores
+        scores = [[normalised(means.at[game, method.label], comparison.bounds[game]) for game in means.index]]
+        known = _aggregates(comparison, {method.label: np.array(scores)}, reps)
+        parts.append(known.assign(**{"from": "game means only", "runs": method.runs}))
+    aggregates = pd.concat(parts, ignore_index=True).assign(games=len(comparison.games))
+    aggregates["protocol_differs"] = aggregates["agent"].map(comparison.differing).fillna("")
+    columns = ["agent", "metric", "value", "low", "high", "runs", "games", "from", "protocol_differs"]
     baseline = comparison.agents[0]
     best = max(comparison.agents, key=lambda agent: float(statistics.iqm(matrices[agent])))
     differences = statistics.iqm_differences(matrices, baseline, reps)
     if best != baseline:
         rest = {agent: matrix for agent, matrix in matrices.items() if agent != baseline}
         differences = pd.concat([differences, statistics.iqm_differences(rest, best, reps)], ignore_index=True)
-    return Analysis(
-        comparison,
-        matrices,
-        statistics.aggregate(matrices, reps),
-        published(comparison, SHOWN),
-        differences,
-        reps,
-    )
+    return Analysis(comparison, matrices, means, aggregates[columns], differences, reps)
 
 
-def published(comparison: Comparison, methods: Sequence[PublishedMethod]) -> pd.DataFrame:
-    """
-    :return: rows games, columns methods, raw mean scores; no columns where a run's steps differ from the published methods',
-        the suite is not normalised by human scores, or a game has no published score
-    """
-    means = published_means(methods, comparison.games if comparison.has_published else [])
-    return means if len(means) == len(comparison.games) else pd.DataFrame(index=comparison.games)
+def _aggregates(comparison: Comparison, matrices: Mapping[str, np.ndarray], reps: int) -> pd.DataFrame:
+    """:return: columns agent, metric, value, low, high, runs"""
+    above = [(agent, comparison.above_one, statistics.games_above(matrix)) for agent, matrix in matrices.items()]
+    tables = [statistics.aggregate(matrices, reps), pd.DataFrame(above, columns=["agent", "metric", "value"])]
+    table = pd.concat(tables, ignore_index=True)
+    table["runs"] = table["agent"].map({agent: len(matrix) for agent, matrix in matrices.items()})
+    return table[table["metric"].isin(comparison.metrics)]
 
 
 def conclusion(analysis: Analysis) -> list[str]:
     """:return: sentences on what the runs show, the most important first"""
     comparison = analysis.comparison
     sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
-    own = {agent: analysis.matrices[agent] for agent in comparison.agents}
-    distinct = distinct_best(own, comparison.differing, analysis.reps)
-    if len(own) > 2 and any(distinct):
-        best = comparison.agents[distinct.index(True)]
+    alike = {agent: analysis.matrices[agent] for agent in comparison.agents if agent not in comparison.differing}
+    best = statistics.distinct_best(alike, analysis.reps)
+    if len(comparison.agents) > 2 and best is not None:
         others = "every other one" + (" with the same protocol" if comparison.differing else "")
         sentences.insert(0, f"{comparison.label(best)} is the best agent: these runs distinguish it from {others}.")
-    elif len(own) > 2:
+    elif len(comparison.agents) > 2:
         sentences.insert(0, "No agent is the best: the one with the highest IQM is not distinguished from all others.")
     if any(abs(row["difference"]) < row["detectable"] for row in analysis.differences.to_dict("records")):
         sentences.append("Four times as many seeds would detect differences half as large.")
@@ -152,24 +158,6 @@ def table_notes(analysis: Analysis) -> list[str]:
         sources = load_reference().drop_duplicates("method").set_index("method")["source"]
         found += [f"† {m.label}: 100K steps, game means only ({m.n_runs}), no interval. {sources[m.method]}." for m in SHOWN]
     return found + [f"‡ {agent}: another protocol: {what}." for agent, what in comparison.differing.items()]
-
-
-def aggregates_file(analysis: Analysis) -> pd.DataFrame:
-    """:return: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs"""
-    comparison = analysis.comparison
-    above = [(agent, comparison.above_one, statistics.games_above(matrix)) for agent, matrix in analysis.matrices.items()]
-    own = pd.concat([analysis.aggregates, pd.DataFrame(above, columns=["agent", "metric", "value"])], ignore_index=True)
-    own = own[own["metric"].isin([*comparison.metrics, *([] if comparison.is_raw else [comparison.above_one])])]
-    own["runs"] = [len(analysis.matrices[agent]) for agent in own["agent"]]
-    own["from"] = "runs"
-    known = aggregate_means(analysis.means, comparison).rename(columns={"label": "agent"})
-    known["metric"] = known["metric"].replace("above 1", comparison.above_one)
-    known["runs"] = known["agent"].map({method.label: method.runs for method in SHOWN})
-    known["from"] = "game means only"
-    table = pd.concat([own, known], ignore_index=True) if len(known) else own
-    table["games"] = len(comparison.games)
-    table["protocol_differs"] = table["agent"].map(comparison.differing).fillna("")
-    return table[["agent", "metric", "value", "low", "high", "runs", "games", "from", "protocol_differs"]]
 
 
 def all_of(values: Iterable[Any]) -> str:

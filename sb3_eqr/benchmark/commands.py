@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.benchmark.dispatch import Processes, finish, last_line, make_table
 from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
@@ -87,6 +88,8 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
     seeds = read_seeds(args.seeds or str(args.default_seeds), args.first_seed)
     runs = plan_runs(args.folder, suite, args.agents, seeds, _command())
     write_plan(args.folder, suite, runs)
+    for agent in dict.fromkeys(args.agents):
+        print(f"{agent}: hyperparameters of {find_agent(agent).file}")
     return runs
 
 

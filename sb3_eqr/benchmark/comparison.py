@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_eqr.benchmark import selection
 from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import PUBLISHED_STEPS
-from sb3_eqr.benchmark.scores import read_runs, score_table
-from sb3_eqr.benchmark.selection import (
-    choose_runs,
-    learns_latent_model,
-    never_learn,
-    protocol_differences,
-    settings_differences,
-)
+from sb3_eqr.benchmark.scores import final_score, normalised, read_runs
 from sb3_eqr.benchmark.statistics import METRICS
 from sb3_eqr.benchmark.suites import RAW, Suite, nearest_name
 
@@ -60,8 +54,8 @@ class Comparison:
 
     @property
     def metrics(self) -> list[str]:
-        """The metrics that mean something."""
-        return [metric for metric in METRICS if metric != "optimality gap" or not self.is_raw]
+        """The aggregates that mean something."""
+        return [metric for metric in METRICS if metric != "optimality gap"] if self.is_raw else [*METRICS, self.above_one]
 
     @property
     def above_one(self) -> str:
@@ -86,14 +80,6 @@ class Comparison:
         times = [result["wall_clock_s"] for result in self.runs(agent)]
         return float(np.mean(times)) / 60 if times else np.nan
 
-    def normalize(self, game: str, raw: Any) -> Any:
-        """
-        :param game: one of ``games``
-        :param raw: score or array of scores
-        """
-        low, high = self.bounds[game]
-        return (raw - low) / (high - low)
-
 
 def compare(
     folders: list[pathlib.Path],
@@ -115,26 +101,34 @@ def compare(
         raise ValueError("folders must be at least one benchmark folder, got none.")
     found = {folder: read(pathlib.Path(folder)) for folder in folders}
     suites = [suite for suite, _ in found.values()]
-    rows = {folder: [row for row in rows if "stopped_at" not in row] for folder, (_, rows) in found.items()}
-    results = _load(rows, [*agents, *([baseline] if baseline and agents else [])])
+    finished = {folder: [row for row in rows if "stopped_at" not in row] for folder, (_, rows) in found.items()}
+    results = _select(finished, [*agents, *([baseline] if baseline and agents else [])])
     bounds = _bounds(suites, results)
-    games, chosen, notes = choose_runs(results, list(dict.fromkeys(g for suite in suites for g in suite.games)), force)
+    games, chosen, notes = selection.choose_runs(results, [game for suite in suites for game in suite.games], force)
     if baseline is not None and baseline not in chosen:
         raise ValueError(f"--baseline must be one of {', '.join(chosen)}, got {baseline!r}.")
-    with_eqr = {row["agent"] for row in results if learns_latent_model(row)}
+    with_eqr = {row["agent"] for row in results if selection.learns_latent_model(row)}
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent in with_eqr, agent))
-    used = [r for r in results if r["game"] in games and r["seed"] in chosen[r["agent"]]]
-    used.sort(key=lambda r: (agents.index(r["agent"]), games.index(r["game"]), r["seed"]))
-    if stopped := sum("stopped_at" in row for _, rows in found.values() for row in rows):
+    used = [row for row in results if row["game"] in games and row["seed"] in chosen[row["agent"]]]
+    used.sort(key=lambda row: (agents.index(row["agent"]), games.index(row["game"]), row["seed"]))
+    if stopped := sum(len(rows) - len(finished[folder]) for folder, (_, rows) in found.items()):
         notes.append(f"{stopped} runs were stopped before their end and are left out.")
-    notes += [*never_learn(used), *settings_differences(used)]
-    differing = protocol_differences(used)
+    notes += [*selection.never_learn(used), *selection.settings_differences(used)]
+    differing = selection.protocol_differences(used)
     if differing and not force:
         raise ValueError(
             "The protocol must be the same for every run of a game, got "
             f"{' '.join(f'{agent}: {what}.' for agent, what in differing.items())} "
             "Select agents with --agents, or pass --force to compare them, marked in every table."
         )
+    rows = [(row["agent"], row["game"], row["seed"], final_score(row)) for row in used]
+    tables = [pd.DataFrame(rows, columns=["agent", "game", "seed", "raw"])]
+    for name, path in references.items():
+        if name in agents:
+            raise ValueError(f"--reference must have a name that no agent has, got {name!r}. Rename it.")
+        tables.append(read_runs(path, name, games))
+    scores = pd.concat(tables, ignore_index=True)
+    scores["score"] = [normalised(raw, bounds[game]) for game, raw in zip(scores["game"], scores["raw"], strict=True)]
     comparison = Comparison(
         suite=" + ".join(dict.fromkeys(suite.name for suite in suites)),
         unit=suites[0].normalisation.unit,
@@ -142,59 +136,41 @@ def compare(
         bounds=bounds,
         games=games,
         agents=agents,
-        scores=pd.DataFrame(),
+        scores=scores,
         results=used,
         differing=differing,
         notes=notes,
     )
     if comparison.human and not comparison.has_published:
         notes.append("Published scores are omitted, because they are for 100,000 steps.")
-    return dataclasses.replace(comparison, scores=_scores(comparison, references))
+    notes += [table.attrs["note"] for table in tables if "note" in table.attrs]
+    return comparison
 
 
-def _scores(comparison: Comparison, references: Mapping[str, pathlib.Path]) -> pd.DataFrame:
-    """:return: columns agent, game, seed, raw, score; adds a note for each reference with unused runs"""
-    final = score_table(comparison.results).query("kind == 'final'")
-    tables = [final.groupby(["agent", "game", "seed"], sort=False)["score"].mean().rename("raw").reset_index()]
-    for name, path in references.items():
-        if name in comparison.agents:
-            raise ValueError(f"--reference must have a name that no agent has, got {name!r}. Rename it.")
-        runs = read_runs(path, name, comparison.games)
-        comparison.notes.extend([runs.attrs["note"]] if "note" in runs.attrs else [])
-        tables.append(runs.rename(columns={"score": "raw"}))
-    table = pd.concat(tables, ignore_index=True)
-    table["score"] = [comparison.normalize(game, raw) for game, raw in zip(table["game"], table["raw"], strict=True)]
-    return table
-
-
-def _load(rows: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[str]) -> list[dict[str, Any]]:
+def _select(finished: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[str]) -> list[dict[str, Any]]:
     """
-    :param rows: folder -> its finished runs
+    :param finished: folder -> its finished runs
     :param agents: the agents to keep; empty: all
     :raises ValueError: for a folder or an agent without finished runs, or a run that is in two folders
     """
-    results: list[dict[str, Any]] = []
-    there: set[str] = set()
-    where: dict[tuple, pathlib.Path] = {}
-    for folder, found in rows.items():
-        if not found:
+    for folder, rows in finished.items():
+        if not rows:
             raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
-        there |= {result["agent"] for result in found}
-        found = [result for result in found if not agents or result["agent"] in agents]
-        for result in found:
-            run = (result["agent"], result["game"], result["seed"])
-            if run in where:
-                raise ValueError(
-                    f"{run[0]}, {run[1]}, seed {run[2]} must be in one folder, got it in {where[run]} and {folder}. "
-                    "Report only one of them."
-                )
-            if not any(evaluation["kind"] == "final" and evaluation["scores"] for evaluation in result["evaluations"]):
-                raise ValueError(f"{folder}: {run[0]}, {run[1]}, seed {run[2]} must have a final evaluation, got none.")
-            where[run] = folder
-        results += found
-    if missing := [agent for agent in agents if agent not in there]:
-        raise ValueError(f"--agents: {missing[0]!r} has no finished run.{nearest_name(missing[0], there)}")
-    return results
+    there = {row["agent"] for rows in finished.values() for row in rows}
+    for agent in agents:
+        if agent not in there:
+            raise ValueError(f"--agents: {agent!r} has no finished run.{nearest_name(agent, there)}")
+    kept = [(folder, row) for folder, rows in finished.items() for row in rows if not agents or row["agent"] in agents]
+    where: dict[tuple, pathlib.Path] = {}
+    for folder, row in kept:
+        run = (row["agent"], row["game"], row["seed"])
+        name = f"{run[0]}, {run[1]}, seed {run[2]}"
+        if run in where:
+            raise ValueError(f"{name} must be in one folder, got it in {where[run]} and {folder}. Report only one of them.")
+        if not any(part["kind"] == "final" and part["scores"] for part in row["evaluations"]):
+            raise ValueError(f"{folder}: {name} must have a final evaluation, got none.")
+        where[run] = folder
+    return [row for _, row in kept]
 
 
 def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
@@ -203,23 +179,23 @@ def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tup
     :raises ValueError: if a game has no bounds, or folders disagree on them
     """
     bounds: dict[str, tuple[float, float]] = {}
+    first = suites[0]
     for suite in suites:
-        unit = suites[0].normalisation.unit
-        if suite.normalisation.unit != unit:
+        if suite.normalisation.unit != first.normalisation.unit:
             raise ValueError(
-                f"The unit of normalisation must be the same in all folders, got {unit!r} in {suites[0].name} and "
-                f"{suite.normalisation.unit!r} in {suite.name}. Report them separately."
+                f"The unit of normalisation must be the same in all folders, got {first.normalisation.unit!r} in {first.name} "
+                f"and {suite.normalisation.unit!r} in {suite.name}. Report them separately."
             )
         for game, (low, high) in suite.normalisation.scores.items():
             if bounds.setdefault(game, (low, high)) != (low, high):
                 raise ValueError(
                     f"The bounds of {game} must be the same in all folders, got {low} and {high} in "
-                    f"{suite.name} and {bounds.get(game)} before. Correct suite.yml."
+                    f"{suite.name} and {bounds[game]} before. Correct suite.yml."
                 )
-    for game in dict.fromkeys(result["game"] for result in results):
-        if game not in bounds:
+    for result in results:
+        if result["game"] not in bounds:
             raise ValueError(
-                f"{game} has no bounds for normalisation in {suites[0].name}, which has them for "
+                f"{result['game']} has no bounds for normalisation in {first.name}, which has them for "
                 f"{', '.join(bounds) or 'no game'}. "
                 "Correct the name, or add the game under normalisation: scores in suite.yml."
             )

@@ -3,7 +3,6 @@ The figures of a report, drawn with rliable and seaborn: counterparts of Figures
 training.
 """
 
-import base64
 import io
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -19,8 +18,8 @@ from sb3_eqr.benchmark import statistics
 from sb3_eqr.benchmark.analysis import Analysis
 from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import SHOWN
-from sb3_eqr.benchmark.scores import evaluation_curve
-from sb3_eqr.benchmark.tables import aggregate_means
+from sb3_eqr.benchmark.scores import evaluation_curve, normalised
+from sb3_eqr.benchmark.statistics import METRICS
 from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
 
 DPI = 160
@@ -41,16 +40,6 @@ class ReportFigure(NamedTuple):
     caption: str
     figure: Figure
 
-    @staticmethod
-    def encoded(png: bytes) -> str:
-        """:return: the image in base64, for the page"""
-        return base64.b64encode(png).decode()
-
-    @staticmethod
-    def width(png: bytes) -> int:
-        """:return: width in pixels of the page, 100 per inch, at which letters are as large as those of the page's notes"""
-        return 100 * int.from_bytes(png[16:20], "big") // DPI
-
 
 def to_png(shown: ReportFigure) -> bytes:
     """:return: the figure as PNG, the same bytes for the same figure; the figure is closed"""
@@ -61,6 +50,11 @@ def to_png(shown: ReportFigure) -> bytes:
         shown.figure.savefig(file, format="png", dpi=DPI, bbox_inches="tight", metadata={"Software": None})
     plt.close(shown.figure)
     return file.getvalue()
+
+
+def width_on_page(png: bytes) -> int:
+    """:return: width in pixels of the page, 100 per inch, at which letters are as large as those of the page's notes"""
+    return 100 * int.from_bytes(png[16:20], "big") // DPI
 
 
 def all_figures(analysis: Analysis) -> list[ReportFigure]:
@@ -115,31 +109,29 @@ def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
 
 
 def _aggregates(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
-    comparison, metrics, agents = analysis.comparison, analysis.comparison.metrics, list(analysis.matrices)
-    by_agent = analysis.aggregates.set_index(["agent", "metric"])
-    points = {comparison.label(a): by_agent.loc[a].loc[metrics, "value"].to_numpy() for a in agents}
-    ends = {comparison.label(a): by_agent.loc[a].loc[metrics, ["low", "high"]].to_numpy().T for a in agents}
-    known = aggregate_means(analysis.means, comparison).pivot(index="label", columns="metric", values="value")
-    for method in SHOWN:
-        if method.label in known.index:
-            points[f"{method.label}, {method.n_runs}"] = known.loc[method.label, metrics].to_numpy()
-            ends[f"{method.label}, {method.n_runs}"] = np.full((2, len(metrics)), np.nan)
+    comparison = analysis.comparison
+    metrics = [metric for metric in comparison.metrics if metric in METRICS]
+    shown = {("runs", agent): comparison.label(agent) for agent in analysis.matrices}
+    known = [method for method in SHOWN if method.label in analysis.means]
+    shown |= {("game means only", method.label): f"{method.label}, {method.n_runs}" for method in known}
+    found = analysis.aggregates.set_index(["from", "agent", "metric"]).sort_index()
+    points = {label: found.loc[key].loc[metrics, "value"].to_numpy() for key, label in shown.items()}
+    ends = {label: found.loc[key].loc[metrics, ["low", "high"]].to_numpy().T for key, label in shown.items()}
     colors = {label: style[label].color if label in style else GREY for label in points}
     figure, axes = plot_utils.plot_interval_estimates(
         points, ends, metrics, colors=colors, subfigure_width=2.2, row_height=0.3, xlabel="", interval_height=0.6
     )
-    for ax in axes:
+    for ax, values in zip(axes, zip(*points.values(), strict=True), strict=True):
         ax.invert_yaxis()
         ax.margins(x=0.08)  # bars do not touch the edge
         ax.set_title(ax.get_title(), fontsize="large")
         ax.tick_params(labelsize="medium", length=2)
         ax.set_xlabel(comparison.unit, fontsize="small")
-        places = range(len(points))
-        ax.plot([values[list(axes).index(ax)] for values in points.values()], places, "o", color=INK, markersize=3)
-    gap = "" if analysis.comparison.is_raw else ", lower for the optimality gap"
+        ax.plot(values, range(len(points)), "o", color=INK, markersize=3)
+    gap = "" if comparison.is_raw else ", lower for the optimality gap"
     caption = f"Over all runs and games. Higher is better for IQM, median and mean{gap}; as Figure 5 (a) of the EqR paper."
     caption += _bands(analysis, "Bars are")
-    if len(known):
+    if known:
         caption += (
             " Points without a bar are from published game means, over as many runs as named. The IQM and optimality gap of "
             "game means differ slightly from those of runs."
@@ -154,12 +146,12 @@ def normalized_curves(comparison: Comparison) -> dict[str, tuple[np.ndarray, np.
     """
     curves = {}
     for agent in comparison.agents:
-        by_run = {}
         evaluated = {(run["seed"], run["game"]): evaluation_curve(run) for run in comparison.runs(agent)}
         digits = max(2, *(len(str(len(steps) - 1)) for steps, _ in evaluated.values()))  # 3 for more than 100 points
+        by_run = {}
         for (seed, game), (steps, raw) in evaluated.items():
             shares = np.round(steps / steps[-1], digits)  # games may differ in steps, and the points of curves by rounding
-            curve = pd.Series(comparison.normalize(game, raw), index=shares)
+            curve = pd.Series(normalised(raw, comparison.bounds[game]), index=shares)
             by_run[seed, game] = curve[~curve.index.duplicated(keep="last")]
         table = pd.DataFrame(by_run).dropna()  # points by runs
         if len(table) > 1:
@@ -202,45 +194,28 @@ def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[Re
     return [ReportFigure("sample_efficiency", "Sample efficiency", caption, figure)]
 
 
-def learning_curves(comparison: Comparison) -> pd.DataFrame:
-    """
-    :return: columns game, agent, seed, step, value: raw mean scores of the evaluations during training; runs that were
-        evaluated only at the end are left out
-    """
+def _learning_curves(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
+    """A panel per game: mean and standard deviation over runs, without those that were evaluated only at the end."""
     frames = []
     for run in comparison.results:
         steps, scores = evaluation_curve(run)
         if len(steps) > 1:
-            named = {"game": run["game"], "agent": comparison.label(run["agent"]), "seed": run["seed"]}
-            frames.append(pd.DataFrame({"step": steps / 1_000, "value": scores}).assign(**named))
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-
-
-def _learning_curves(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
-    table = learning_curves(comparison)
-    if not len(table):
+            agent = comparison.label(run["agent"])
+            curve = {"game": run["game"], "agent": agent, "seed": run["seed"], "step": steps / 1_000, "score": scores}
+            frames.append(pd.DataFrame(curve))
+    if not frames:
         return []
-    several = table["seed"].nunique() > 1
-    caption = "Raw scores of the evaluations during training. "
-    caption += "Means over runs ± one standard deviation." if several else "A single run each."
+    table = pd.concat(frames, ignore_index=True)
     shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
-    return [ReportFigure("learning_curves", "Learning curves", caption, _small_multiples(table, "mean raw score", shown))]
-
-
-def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]) -> Figure:
-    """A panel per game: mean and standard deviation over runs."""
     grid = sns.relplot(
         table,
         x="step",
-        y="value",
+        y="score",
         col="game",
         hue="agent",
         style="agent",
-        hue_order=list(style),
-        style_order=list(style),
-        palette={agent: look.color for agent, look in style.items()},
-        markers={agent: look.marker for agent, look in style.items()},
-        dashes=True,
+        palette={agent: look.color for agent, look in shown.items()},
+        markers={agent: look.marker for agent, look in shown.items()},
         kind="line",
         errorbar="sd",
         markeredgewidth=0,
@@ -251,10 +226,12 @@ def _small_multiples(table: pd.DataFrame, ylabel: str, style: Mapping[str, Look]
         facet_kws={"sharey": False},
     )
     for ax in grid.axes.flat:
-        for line, look in zip(ax.get_lines(), style.values(), strict=False):
+        for line, look in zip(ax.get_lines(), shown.values(), strict=False):
             line.set_linestyle(look.line)
     grid.figure.set_layout_engine("constrained")
     grid.set(xlim=(0, None))
-    grid.set_titles("{col_name}").set_axis_labels("steps (thousands)", ylabel)
-    _legend(grid.figure, style)
-    return grid.figure
+    grid.set_titles("{col_name}").set_axis_labels("steps (thousands)", "mean raw score")
+    _legend(grid.figure, shown)
+    caption = "Raw scores of the evaluations during training. "
+    caption += "Means over runs ± one standard deviation." if table["seed"].nunique() > 1 else "A single run each."
+    return [ReportFigure("learning_curves", "Learning curves", caption, grid.figure)]

@@ -9,7 +9,7 @@ import pathlib
 import re
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
 from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, read_suite
@@ -19,10 +19,8 @@ SUFFIX = ".jsonl.xz"
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
 
 
-class Checked(BaseModel):
+class Checked(BaseModel, strict=True):
     """A model that rejects values of another type; more keys are legal."""
-
-    model_config = ConfigDict(strict=True)
 
 
 class Evaluated(Checked):
@@ -51,6 +49,19 @@ class Protocol(Checked):
     evaluation: Evaluation
 
 
+class Entry(Checked):
+    """The agent."""
+
+    algo: str
+    hyperparameters: dict[str, Any]
+
+
+class Machine(Checked):
+    """What it was trained on."""
+
+    threads: PositiveInt
+
+
 class Row(Checked):
     """What a report needs of a run; rows have more."""
 
@@ -59,10 +70,10 @@ class Row(Checked):
     seed: NonNegativeInt
     suite: str
     protocol: Protocol
-    entry: dict[str, Any]
+    entry: Entry
     command: str
     started: str
-    machine: dict[str, Any]
+    machine: Machine
     attempts: NonNegativeInt
     wall_clock_s: FiniteFloat
     steps_per_second: FiniteFloat
@@ -76,15 +87,13 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
     """
     :param path: folder of a benchmark, or a file of :func:`pack`
     :return: its suite, and a row per run that has finished or was stopped; the latter have "stopped_at", a step
-    :raises ValueError: if the path is neither
+    :raises ValueError: if the path is neither, or holds a damaged file
     """
     if path.is_file():
         try:
             with lzma.open(path, "rt", encoding="utf-8") as lines:
-                first, *rows = [json.loads(line) for line in lines]
-            for row in rows:
-                check_row(row)
-            return Suite.model_validate(first["suite"]), rows
+                first, *others = lines
+            return Suite.model_validate(json.loads(first)["suite"]), [_row(line) for line in others]
         except (lzma.LZMAError, EOFError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path} must be a file of sb3-eqr benchmark pack, got another or a damaged one ({error})."
@@ -93,26 +102,25 @@ def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
         found = "one without suite.yml" if path.is_dir() else "no folder"
         raise ValueError(f"{path} must be a folder of sb3-eqr benchmark run, got {found}. Run sb3-eqr benchmark run first.")
     files = {file.parent: file for name in (STOPPED, RESULT) for file in path.glob(f"runs/*/*/*/{name}")}
-    return read_suite(path / SUITE), [_read_row(files[folder]) for folder in sorted(files)]
+    rows = []
+    for _, file in sorted(files.items()):
+        try:
+            rows.append(_row(file.read_text(encoding="utf-8")))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"{file} must be the result of a run, got a damaged file ({error}). Remove it and run it again."
+            ) from error
+    return read_suite(path / SUITE), rows
 
 
-def check_row(row: Any) -> None:
-    """Raise ValueError, which names the first mistake, if this is not a row of a run."""
+def _row(text: str) -> dict[str, Any]:
+    """:raises ValueError: with the first mistake, if the text is not the row of a run"""
+    row = json.loads(text)
     try:
         Row.model_validate(row)
     except ValidationError as error:
         raise ValueError(first_mistake(error).removesuffix(".")) from error
-
-
-def _read_row(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        row = json.loads(path.read_text(encoding="utf-8"))
-        check_row(row)
-        return row
-    except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{path} must be the result of a run, got a damaged file ({error}). Remove it and run it again."
-        ) from error
+    return row
 
 
 def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
@@ -130,12 +138,7 @@ def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
         old, kept = read(file)
         suite, rows = merge(old, suite), [*kept, *rows]
     by_run = {(row["agent"], row["game"], row["seed"]): row for row in rows}
-    write(file, suite, [by_run[run] for run in sorted(by_run)])
-    return len(by_run)
-
-
-def write(file: pathlib.Path, suite: Suite, rows: list[dict[str, Any]]) -> None:
-    """Write a suite and its runs."""
-    lines = [ABSOLUTE.sub("", json.dumps(line)) + "\n" for line in ({"suite": suite.model_dump()}, *rows)]
+    lines = [{"suite": suite.model_dump()}, *(by_run[run] for run in sorted(by_run))]
     with atomic_write(file, "file") as out:
-        out.write(lzma.compress("".join(lines).encode()))
+        out.write(lzma.compress("".join(ABSOLUTE.sub("", json.dumps(line)) + "\n" for line in lines).encode()))
+    return len(by_run)

@@ -1,32 +1,23 @@
 """The report of a benchmark: a page, figures, tables and data files from folders of runs."""
 
+import base64
 import importlib.metadata
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+import pandas as pd
 
-from sb3_eqr.benchmark.analysis import Analysis, aggregates_file, all_of, analyse, conclusion, counted, notes, table_notes
+from sb3_eqr.benchmark.analysis import all_of, analyse, conclusion, counted, notes, table_notes
 from sb3_eqr.benchmark.comparison import Comparison, compare
-from sb3_eqr.benchmark.figures import all_figures, to_png
+from sb3_eqr.benchmark.figures import all_figures, to_png, width_on_page
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.statistics import REPS
-from sb3_eqr.benchmark.tables import (
-    Table,
-    difference_table,
-    game_table,
-    make_table,
-    number,
-    to_html,
-    to_markdown,
-)
+from sb3_eqr.benchmark.tables import Table, difference_table, game_table, make_table, number, to_html, to_markdown
 from sb3_eqr.common.saving.files import atomic_write
-
-TEMPLATE = pathlib.Path(__file__).with_name("report.html.jinja")
 
 
 def write_report(
@@ -56,43 +47,44 @@ def write_report(
     comparison = compare(folders, references, force, agents, baseline)
     analysis = analyse(comparison, reps)
     figures = all_figures(analysis)
-    table = game_table(comparison, analysis.aggregates, analysis.matrices, analysis.means, reps)
-    files = {f"{figure.name}.png": to_png(figure) for figure in figures}
-    files["table.md"] = _markdown(analysis, table)
-    files["aggregates.csv"] = aggregates_file(analysis).to_csv(index=False).encode()
-    before, shown = notes(analysis), conclusion(analysis)
+    pictures = {f"{figure.name}.png": to_png(figure) for figure in figures}
+    games = game_table(comparison, analysis.matrices, analysis.means, analysis.aggregates, reps)
+    differences = difference_table(comparison) if len(analysis.matrices) > 1 else None
+    said, noted, about = conclusion(analysis), notes(analysis), table_notes(analysis)
     environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
     )
-    page = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        title=f"Benchmark {comparison.suite}",
-        style=Markup(TEMPLATE.with_name("report.css").read_text(encoding="utf-8")),
+    page = environment.get_template("report.html.jinja").render(
+        comparison=comparison,
         lead=_lead(comparison),
-        conclusion=shown,
-        notes=before,
-        figures=[(figure, files[f"{figure.name}.png"]) for figure in figures],
-        human=comparison.human,
-        raw=comparison.is_raw,
-        games=_html(table),
-        differences=_html(difference_table(comparison)) if len(analysis.matrices) > 1 else "",
-        about_games=table_notes(analysis),
+        conclusion=said,
+        notes=noted,
+        figures=[
+            (figure, base64.b64encode(png).decode(), width_on_page(png))
+            for figure, png in zip(figures, pictures.values(), strict=True)
+        ],
+        games=to_html(games),
+        differences=to_html(differences) if differences else "",
+        about_games=about,
         settings=_settings(comparison),
-        commands=_commands(comparison, command),
+        commands=[*dict.fromkeys(result["command"] for result in comparison.results if result["command"]), command],
         versions=all_of(f"{name} {importlib.metadata.version(name)}" for name in ("rliable", "numpy", "scipy", "pandas")),
     )
+    compared = to_markdown(differences) if differences else ""
+    markdown = [to_markdown(games), *(f"- {sentence}" for sentence in [*said, *noted, *about]), "", compared]
+    files = {**pictures, "table.md": "\n".join(markdown).encode()}
+    files["aggregates.csv"] = analysis.aggregates.to_csv(index=False).encode()
     files["report.html"] = page.encode()  # last: where it exists, so do the others
-    for sentence in shown:
+    for sentence in [*said, *(f"Note: {note}" for note in noted)]:
         print(sentence)
-    for note in before:
-        print(f"Note: {note}")
     for name, content in files.items():
-        with atomic_write(pathlib.Path(output) / name, pathlib.Path(name).suffix[1:]) as file:
+        with atomic_write(output / name, "") as file:
             file.write(content)
-    return pathlib.Path(output) / "report.html"
-
-
-def _html(table: Table, kind: str = "numbers") -> Markup:
-    return Markup(to_html(table, kind))  # to_html escapes the cells
+    return output / "report.html"
 
 
 def _lead(comparison: Comparison) -> str:
@@ -109,14 +101,8 @@ def _lead(comparison: Comparison) -> str:
     )
 
 
-def _markdown(analysis: Analysis, table: Table) -> bytes:
-    about = [*conclusion(analysis), *notes(analysis), *table_notes(analysis)]
-    compared = to_markdown(difference_table(analysis.comparison)) if len(analysis.matrices) > 1 else ""
-    return "\n".join([to_markdown(table), *(f"- {note}" for note in about), "", compared]).encode()
-
-
-def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
-    """:return: headings and tables: settings and machine of each agent"""
+def _settings(comparison: Comparison) -> list[tuple[str, str]]:
+    """:return: headings and tables in HTML: settings and machine of each agent"""
     rows = []
     for agent in comparison.agents:
         runs = comparison.runs(agent)
@@ -126,31 +112,25 @@ def _settings(comparison: Comparison) -> list[tuple[str, Markup]]:
         restarted = str(sum(bool(run["resumed_at"]) or run["attempts"] > 1 for run in runs))
         rows.append([comparison.label(agent), seeds, device, threads, number(comparison.minutes(agent)), speed, restarted])
     header = ["agent", "seeds", "device", "threads", "minutes per run", "steps/s", "restarted runs"]
-    paths = {"Hyperparameters": ("entry", "hyperparameters"), "Protocol": ("protocol",), "Versions": ("versions",)}
-    compared = [(heading, _html(_side_by_side(comparison, path), "words")) for heading, path in paths.items()]
-    return [("Runs", _html(make_table(header, rows))), *compared]
+    tables = {
+        "Hyperparameters": _side_by_side(comparison, lambda run: run["entry"]["hyperparameters"]),
+        "Protocol": _side_by_side(comparison, lambda run: run["protocol"]),
+        "Versions": _side_by_side(comparison, lambda run: run["versions"]),
+    }
+    words = [(heading, to_html(table, "words")) for heading, table in tables.items()]
+    return [("Runs", to_html(make_table(header, rows))), *words]
 
 
-def _side_by_side(comparison: Comparison, path: Sequence[str]) -> Table:
-    """
-    :return: a row per setting, a column per agent; where runs of an agent differ, all values separated by "/"
-    """
+def _side_by_side(comparison: Comparison, settings: Callable[[dict[str, Any]], dict[str, Any]]) -> Table:
+    """:return: a row per setting, a column per agent; where runs of an agent differ, all values separated by "/" """
 
-    def of(run: dict[str, Any]) -> dict[str, str]:
-        for key in path:
-            run = run[key]
-        return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flatten(run).items()}
+    def texts(run: dict[str, Any]) -> dict[str, str]:
+        found = flatten(settings(run)).items()
+        return {key: value if isinstance(value, str) else json.dumps(value) for key, value in found}
 
-    by_agent = {comparison.label(agent): [of(run) for run in comparison.runs(agent)] for agent in comparison.agents}
-    keys = dict.fromkeys(key for runs in by_agent.values() for run in runs for key in run)
-    rows = [
-        [key, *(" / ".join(dict.fromkeys(run.get(key, "–") for run in runs)) for runs in by_agent.values())] for key in keys
-    ]
-    if len(by_agent) > 1 and all(len(set(row[1:])) == 1 for row in rows):
-        return make_table(["setting", "all agents"], [row[:2] for row in rows])
-    return make_table(["setting", *by_agent], rows)
-
-
-def _commands(comparison: Comparison, command: str) -> list[str]:
-    """:return: the commands that reproduce the runs and the report"""
-    return [*dict.fromkeys(result["command"] for result in comparison.results if result["command"]), command]
+    labels = np.array([comparison.label(run["agent"]) for run in comparison.results])
+    table = pd.DataFrame([texts(run) for run in comparison.results]).fillna("–")
+    table = table.groupby(labels, sort=False).agg(lambda found: " / ".join(found.unique())).T
+    if len(table.columns) > 1 and (table.nunique(axis=1) == 1).all():
+        table = table.iloc[:, :1].set_axis(["all agents"], axis=1)
+    return make_table(["setting", *table], [[key, *row] for key, row in zip(table.index, table.to_numpy(), strict=True)])

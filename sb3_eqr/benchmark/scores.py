@@ -2,6 +2,7 @@
 
 import pathlib
 from collections.abc import Iterable
+from statistics import fmean
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,23 +15,6 @@ from sb3_eqr.benchmark.reference import plain_game
 
 # game -> scores of runs
 RUNS = TypeAdapter(Annotated[dict[str, Annotated[list[FiniteFloat], Len(1)]], Len(1)], config={"strict": True})
-COLUMNS = ["agent", "game", "seed", "step", "kind", "episode", "score", "length"]
-
-
-def score_table(results: list[dict[str, Any]]) -> pd.DataFrame:
-    """
-    :param results: rows of finished runs, see :func:`~sb3_eqr.benchmark.packed.read`
-    :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
-        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
-    """
-    frames = []
-    for result in results:
-        training = result["training"]
-        parts = [(row["kind"], row["step"], row["scores"], row["lengths"]) for row in result["evaluations"]]
-        for kind, step, scores, lengths in [*parts, ("training", training["step"], training["score"], training["length"])]:
-            rows = {"step": step, "kind": kind, "episode": range(len(scores)), "score": scores, "length": lengths}
-            frames.append(pd.DataFrame(rows).assign(agent=result["agent"], game=result["game"], seed=result["seed"]))
-    return pd.concat(frames, ignore_index=True)[COLUMNS] if frames else pd.DataFrame(columns=COLUMNS)
 
 
 def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
@@ -38,23 +22,42 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
     Load every episode of every finished run of a benchmark.
 
     :param folder: folder of the benchmark, or a file of ``sb3-eqr benchmark pack``
-    :return: see :func:`score_table`
+    :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
+        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
     :raises ValueError: for a folder without finished runs
     """
-    results = [row for row in read(pathlib.Path(folder))[1] if "stopped_at" not in row]
-    if not results:
+    frames = []
+    for row in read(pathlib.Path(folder))[1]:
+        if "stopped_at" in row:
+            continue
+        training = row["training"]
+        parts = [(part["step"], part["kind"], part["scores"], part["lengths"]) for part in row["evaluations"]]
+        for step, kind, scores, lengths in [*parts, (training["step"], "training", training["score"], training["length"])]:
+            run = {"agent": row["agent"], "game": row["game"], "seed": row["seed"]}
+            part = {"step": step, "kind": kind, "episode": range(len(scores)), "score": scores, "length": lengths}
+            frames.append(pd.DataFrame(run | part))
+    if not frames:
         raise ValueError(f"{folder} must be the folder of a benchmark, got one without finished runs.")
-    return score_table(results)
+    return pd.concat(frames, ignore_index=True)
+
+
+def final_score(result: dict[str, Any]) -> float:
+    """:return: the mean raw score of its final evaluation"""
+    return fmean(score for part in result["evaluations"] if part["kind"] == "final" for score in part["scores"])
 
 
 def evaluation_curve(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """:return: steps (points,), mean raw scores (points,) of its evaluations during training, including the final one"""
-    found: dict[int, float] = {}
-    for evaluation in sorted(result["evaluations"], key=lambda row: row["kind"] == "final"):  # the final one overrides
-        if evaluation["scores"]:
-            found[evaluation["step"]] = float(np.mean(evaluation["scores"]))
+    ordered = sorted(result["evaluations"], key=lambda part: part["kind"] == "final")  # the final one overrides
+    found = {part["step"]: np.mean(part["scores"]) for part in ordered if part["scores"]}
     steps = sorted(found)
     return np.array(steps), np.array([found[step] for step in steps])
+
+
+def normalised(raw: Any, bounds: tuple[float, float]) -> Any:
+    """:return: a score or an array of scores, of which the first bound becomes 0 and the second 1"""
+    low, high = bounds
+    return (raw - low) / (high - low)
 
 
 def read_runs(path: pathlib.Path, name: str, games: Iterable[str]) -> pd.DataFrame:
@@ -63,7 +66,7 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str]) -> pd.DataFra
 
     :param path: a JSON file: game, in any spelling -> raw scores, one per run; other games are left out
     :param name: name of the method
-    :return: columns agent, game, seed, score; for every game the first runs, as many as the game with the fewest has; if
+    :return: columns agent, game, seed, raw; for every game the first runs, as many as the game with the fewest has; if
         that leaves some out, ``attrs["note"]`` says so
     :raises ValueError: for a file that is not JSON or has another form, and for missing games
     """
@@ -76,16 +79,16 @@ def read_runs(path: pathlib.Path, name: str, games: Iterable[str]) -> pd.DataFra
         mistake = error.errors()[0]
         where = "".join(f"{place}: " for place in mistake["loc"])
         raise ValueError(f"{expected}, got {where}{mistake['msg']}. Write its runs as lists of finite numbers.") from error
-    by_plain, games = {plain_game(game): scores for game, scores in content.items()}, list(games)
-    if missing := [game for game in games if plain_game(game) not in by_plain]:
+    by_plain = {plain_game(game): scores for game, scores in content.items()}
+    wanted = {game: by_plain.get(plain_game(game), []) for game in games}
+    if missing := [game for game, scores in wanted.items() if not scores]:
         raise ValueError(
-            f"--reference {name}: {path} must contain scores for {', '.join(games)}, got none for {', '.join(missing)}, "
+            f"--reference {name}: {path} must contain scores for {', '.join(wanted)}, got none for {', '.join(missing)}, "
             f"only for {', '.join(content)}. Add them, correct their names, or report without this reference."
         )
-    wanted = {game: by_plain[plain_game(game)] for game in games}
     runs = min(map(len, wanted.values()))
-    rows = [(name, game, seed, float(score)) for game in games for seed, score in enumerate(wanted[game][:runs])]
-    table = pd.DataFrame(rows, columns=["agent", "game", "seed", "score"])
+    rows = [(name, game, seed, score) for game, scores in wanted.items() for seed, score in enumerate(scores[:runs])]
+    table = pd.DataFrame(rows, columns=["agent", "game", "seed", "raw"])
     if max(map(len, wanted.values())) > runs:
         table.attrs["note"] = f"{name}: the first {runs} runs of every game only, as many as all of them have."
     return table

@@ -1,7 +1,8 @@
 """
 Aggregate scores as rliable defines them (Agarwal et al. 2021, https://arxiv.org/abs/2108.13264), each with its 95 % interval.
 rliable draws the bootstrap samples; aggregating all of them at once takes a hundredth of the time of rliable's loop. The
-intervals of a single run are NaN.
+intervals of a single run are NaN. A matrix, (runs, games), holds the normalised scores of an agent, and ``matrices`` are
+agent -> matrix.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,6 +17,7 @@ CONFIDENCE = 0.95
 MIN_RUNS = 3  # for a verdict: two runs hardly show how much scores differ by chance
 REPS = 2_000  # bootstrap samples, stratified by game, as for rliable's profiles
 Estimate = tuple[np.ndarray, np.ndarray, np.ndarray]  # value, low, high
+Matrices = Mapping[str, np.ndarray]
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
@@ -31,40 +33,25 @@ METRICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def aggregates_of(scores: np.ndarray) -> np.ndarray:
-    """(..., runs, games) -> (..., 4), in the order of ``METRICS``."""
-    return np.stack([function(scores) for function in METRICS.values()], axis=-1)
-
-
-def resample(*matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> list[np.ndarray]:
-    """
-    :param matrices: (runs, games, ...), of one agent each; resampled independently of each other
-    :param reps: number of bootstrap samples
-    :param seed: seed for NumPy's global generator, which rliable always uses; its state is restored afterwards
-    :return: (reps, runs, games, ...) each
-    """
-    kind = library.StratifiedBootstrap if len(matrices) == 1 else library.StratifiedIndependentBootstrap
+def resample(matrix: np.ndarray, reps: int, seed: int = 0) -> np.ndarray:
+    """(runs, games, ...) -> (reps, runs, games, ...): bootstrap samples."""
     state = np.random.get_state()
-    np.random.seed(seed)
+    np.random.seed(seed)  # rliable always uses the global generator
     try:
-        samples = [arrays for arrays, _ in kind(*matrices).bootstrap(reps)]
+        return np.stack([sample for (sample,), _ in library.StratifiedBootstrap(matrix).bootstrap(reps)])
     finally:
         np.random.set_state(state)
-    return [np.stack(drawn) for drawn in zip(*samples, strict=True)]
 
 
-def estimate(function: Callable[..., np.ndarray], *matrices: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
+def estimate(function: Callable[[np.ndarray], np.ndarray], matrix: np.ndarray, reps: int, seed: int = 0) -> Estimate:
     """
-    :param function: maps arrays (..., runs, games) to (...) or (..., n)
-    :param matrices: (runs, games, ...), of one agent each
-    :param reps: number of bootstrap samples
-    :param seed: seed of the bootstrap
+    :param function: maps arrays (..., runs, games, ...) to (...) or (..., n)
+    :param matrix: (runs, games, ...)
     """
-    value = function(*matrices)
-    if min(map(len, matrices)) < 2:
+    value = function(matrix)
+    if len(matrix) < 2:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
-    ends = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2
-    low, high = np.quantile(function(*resample(*matrices, reps=reps, seed=seed)), ends, axis=0)
+    low, high = np.quantile(function(resample(matrix, reps, seed)), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     return value, low, high
 
 
@@ -74,28 +61,26 @@ def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
     :return: agent -> (runs, games), games in alphabetical order
     :raises ValueError: if an agent's number of runs differs between games
     """
-    games = sorted(scores["game"].unique())
     matrices = {}
     for agent, rows in scores.groupby("agent", sort=False):
-        runs = rows.groupby("game")["seed"].nunique().reindex(games, fill_value=0)
-        if runs.nunique() != 1:
-            counts = ", ".join(f"{game}: {count}" for game, count in runs.items())
+        table = rows.pivot(index="seed", columns="game", values="score").reindex(columns=sorted(scores["game"].unique()))
+        if table.isna().any(axis=None):
+            counts = ", ".join(f"{game}: {count}" for game, count in table.count().items())
             raise ValueError(f"{agent} must have the same number of runs on every game, got {counts}.")
-        columns = [rows[rows["game"] == game].sort_values("seed")["score"].to_numpy() for game in games]
-        matrices[str(agent)] = np.stack(columns, axis=1)
+        matrices[str(agent)] = np.ascontiguousarray(table)
     return matrices
 
 
-def aggregate(matrices: Mapping[str, np.ndarray], reps: int = REPS, seed: int = 0) -> pd.DataFrame:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :return: columns agent, metric, value, low, high
-    """
-    rows = [
-        (agent, *row)
-        for agent, matrix in matrices.items()
-        for row in zip(METRICS, *estimate(aggregates_of, matrix, reps=reps, seed=seed), strict=True)
-    ]
+def aggregate(matrices: Matrices, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
+    """:return: columns agent, metric, value, low, high"""
+
+    def all_metrics(scores: np.ndarray) -> np.ndarray:
+        return np.stack([function(scores) for function in METRICS.values()], axis=-1)
+
+    found = {
+        agent: zip(METRICS, *estimate(all_metrics, matrix, reps, seed), strict=True) for agent, matrix in matrices.items()
+    }
+    rows = [(agent, *row) for agent, rows in found.items() for row in rows]
     return pd.DataFrame(rows, columns=["agent", "metric", "value", "low", "high"])
 
 
@@ -103,7 +88,6 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
     """
     The fraction of runs, over all games, that score above a threshold (Agarwal et al. 2021, section 4.2; Fig. 4 of EqR).
 
-    :param matrix: (runs, games), normalised scores
     :param thresholds: (n,), in the unit of the scores
     :return: (n,) each, with pointwise intervals
     """
@@ -111,39 +95,35 @@ def performance_profile(matrix: np.ndarray, thresholds: np.ndarray, reps: int = 
     def fractions(scores: np.ndarray) -> np.ndarray:
         return np.stack([(scores > threshold).mean(axis=(-2, -1)) for threshold in thresholds], axis=-1)
 
-    return estimate(fractions, matrix, reps=reps, seed=seed)
+    return estimate(fractions, matrix, reps, seed)
 
 
-def sample_efficiency(curves: np.ndarray, reps: int = REPS, seed: int = 0) -> Estimate:
+def sample_efficiency(curves: np.ndarray, reps: int = REPS) -> Estimate:
     """
     :param curves: (runs, games, points), normalised scores of the evaluations during training
     :return: IQM, low, high: (points,) each
     """
-    return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps=reps, seed=seed)
+    return estimate(lambda scores: iqm(np.moveaxis(scores, -1, -3)), curves, reps)
 
 
-def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS, seed: int = 0) -> float:
+def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REPS) -> float:
     """
     The smallest difference between the IQMs of two agents that their runs can detect: half the width of the 95 % interval
     around a difference of 0. It uses the bootstrap's variances times n / (n - 1), because a bootstrap of n runs
     underestimates them by that factor, and Student's quantile with games (n₁ + n₂ - 2) degrees of freedom. Without both
     corrections, 2 runs on 3 games would distinguish identical agents in a fifth of all cases.
 
-    :param first: (runs, games), normalised scores
-    :param second: (runs, games), where the number of runs may differ from the first's
     :return: the difference in the unit of the scores; NaN if either agent has a single run, whose spread is unknown
     """
     if min(len(first), len(second)) < 2:
         return np.nan
-    samples = [iqm(resample(matrix, reps=reps, seed=seed)[0]) for matrix in (first, second)]
-    variance = sum(np.var(s) * len(m) / (len(m) - 1) for s, m in zip(samples, (first, second), strict=True))
+    variance = sum(np.var(iqm(resample(matrix, reps))) * len(matrix) / (len(matrix) - 1) for matrix in (first, second))
     freedom = first.shape[1] * (len(first) + len(second) - 2)
     return float(student.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(variance))
 
 
-def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
+def iqm_differences(matrices: Matrices, baseline: str, reps: int = REPS) -> pd.DataFrame:
     """
-    :param matrices: agent -> (runs, games), normalised scores
     :param baseline: the agent that the others are compared with
     :return: columns agent, baseline, runs, baseline_runs, games, difference (of the IQMs, agent - baseline), detectable
         (see :func:`detectable_difference`; NaN for fewer than ``MIN_RUNS`` runs)
@@ -157,19 +137,26 @@ def iqm_differences(matrices: Mapping[str, np.ndarray], baseline: str, reps: int
             "baseline_runs": len(other),
             "games": matrix.shape[1],
             "difference": iqm(matrix) - iqm(other),
-            "detectable": detectable_difference(matrix, other, reps, seed)
-            if min(len(matrix), len(other)) >= MIN_RUNS
-            else np.nan,
+            "detectable": detectable_difference(matrix, other, reps) if min(len(matrix), len(other)) >= MIN_RUNS else np.nan,
         }
         for agent, matrix in matrices.items()
         if agent != baseline
     )
 
 
-def games_above(matrix: np.ndarray, bound: float = 1.0) -> int:
-    """
-    :param matrix: (runs, games), normalised scores
-    :param bound: 1 is the human score where scores are human-normalised, for the "superhuman games" of the EqR paper's tables
-    :return: number of games whose mean over runs is above the bound
-    """
-    return int((matrix.mean(axis=0) > bound).sum())
+def distinct_best(matrices: Matrices, reps: int) -> str | None:
+    """:return: the agent with the highest IQM, if these runs distinguish it from every other one"""
+    if len(matrices) < 2 or min(map(len, matrices.values())) < MIN_RUNS:
+        return None
+    best = max(matrices, key=lambda agent: float(iqm(matrices[agent])))
+    is_distinct = all(
+        iqm(matrices[best]) - iqm(matrix) > detectable_difference(matrices[best], matrix, reps)
+        for agent, matrix in matrices.items()
+        if agent != best
+    )
+    return best if is_distinct else None
+
+
+def games_above(matrix: np.ndarray) -> int:
+    """:return: number of games whose mean is above 1: the "superhuman games" of the EqR paper, if 1 is the human score"""
+    return int((matrix.mean(axis=0) > 1).sum())

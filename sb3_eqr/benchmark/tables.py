@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 from scipy.stats import ttest_ind
 
 from sb3_eqr.benchmark.comparison import Comparison
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM
-from sb3_eqr.benchmark.statistics import METRICS, MIN_RUNS, detectable_difference, games_above, iqm
+from sb3_eqr.benchmark.statistics import METRICS, distinct_best
 
 
 class Table(NamedTuple):
@@ -37,7 +38,7 @@ def make_table(header: Sequence[str], rows: Sequence[Sequence[str]], bold: Seque
     return Table(cells, pd.DataFrame(is_bold, columns=cells.columns))
 
 
-def to_html(table: Table, kind: str = "numbers") -> str:
+def to_html(table: Table, kind: str = "numbers") -> Markup:
     """
     :param kind: "numbers" or "words", for the alignment of the columns
     :return: a table in a box that scrolls horizontally
@@ -45,7 +46,7 @@ def to_html(table: Table, kind: str = "numbers") -> str:
     escaped = Table(table.cells.map(html.escape).rename(columns=html.escape), table.bold.rename(columns=html.escape))
     cells = escaped.emphasised("<b>", "</b>").replace(r"\n(.*)", r"<br><small>\1</small>", regex=True)
     content = cells.to_html(index=False, escape=False, border=0, classes=kind)
-    return f'<div class="box" tabindex="0">{content}</div>'
+    return Markup(f'<div class="box" tabindex="0">{content}</div>')  # whose cells are escaped
 
 
 def to_markdown(table: Table) -> str:
@@ -72,84 +73,43 @@ def decimals_of(value: float) -> int:
     return 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
 
 
-def with_interval(value: float, low: float, high: float) -> str:
-    """:return: "0.230", and below it "[0.120, 0.340]" where there is an interval"""
-    return number(value, 3) + ("" if np.isnan(low) else f"\n[{number(low, 3)}, {number(high, 3)}]")
-
-
-def distinct_best(matrices: Mapping[str, np.ndarray], differing: Mapping[str, str], reps: int) -> list[bool]:
-    """
-    :param matrices: agent -> (runs, games), normalised scores
-    :param differing: agents to leave out, because their protocol differs
-    :return: for each agent, whether it is the best and these runs distinguish it from all others
-    """
-    values = {agent: float(iqm(matrix)) for agent, matrix in matrices.items() if agent not in differing}
-    best = max(values, key=lambda agent: values[agent], default="")
-    is_distinct = (
-        len(values) > 1
-        and min(len(matrices[agent]) for agent in values) >= MIN_RUNS
-        and all(
-            values[best] - value > detectable_difference(matrices[best], matrices[agent], reps)
-            for agent, value in values.items()
-            if agent != best
-        )
-    )
-    return [is_distinct and agent == best for agent in matrices]
-
-
-def aggregate_means(means: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
-    """
-    Aggregates of methods with known game means only, computed as for a single run with these scores.
-
-    :param means: rows games, columns methods, raw
-    :return: columns label, metric, value; the metrics of ``METRICS`` and "above 1"
-    """
-    rows = []
-    for method in means:
-        values = np.array([[comparison.normalize(game, means.at[game, method]) for game in means.index]])  # (1, games)
-        rows += [(method, name, float(function(values))) for name, function in METRICS.items()]
-        rows.append((method, "above 1", games_above(values)))
-    return pd.DataFrame(rows, columns=["label", "metric", "value"])
-
-
 def game_table(
-    comparison: Comparison, aggregates: pd.DataFrame, matrices: Mapping[str, np.ndarray], means: pd.DataFrame, reps: int
+    comparison: Comparison, matrices: Mapping[str, np.ndarray], means: pd.DataFrame, aggregates: pd.DataFrame, reps: int
 ) -> Table:
     """
-    A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below.
+    A table as Tables 2 to 4 of the EqR paper: raw scores per game, aggregates of normalised scores below. In bold are agents
+    that these runs distinguish from all others with the same protocol.
 
-    :param aggregates: columns agent, metric, value, low, high
-    :param matrices: agent -> (runs, games), normalised scores
-    :param means: see :func:`~sb3_eqr.benchmark.analysis.published`
+    ``matrices``, ``means``, ``aggregates`` and ``reps`` are those of :class:`~sb3_eqr.benchmark.analysis.Analysis`.
     """
     names = (RANDOM, HUMAN) if comparison.human else () if comparison.is_raw else ("score 0", "score 1")
     header = ["game", *names, *map(comparison.label, matrices), *(f"{method} †" for method in means)]
+    alike = {agent: matrix for agent, matrix in matrices.items() if agent not in comparison.differing}
     by_game = comparison.scores.groupby(["agent", "game"])["raw"].agg(["mean", "std"])
-    rows, bold = [], []
+    rows, best = [], []
     for game in comparison.games:
-        place = sorted(comparison.games).index(game)  # the game's column
-        found = [by_game.loc[(agent, game)] for agent in matrices]
-        texts = [
-            number(mean) + ("" if np.isnan(spread) else f"\n± {number(spread, decimals_of(mean))}") for mean, spread in found
-        ]
         bounds = [number(bound) for bound in comparison.bounds[game] if names]
-        rows.append([game, *bounds, *texts, *(number(means.at[game, method]) for method in means)])
-        of_game = {agent: matrix[:, [place]] for agent, matrix in matrices.items()}
-        is_best = distinct_best(of_game, comparison.differing, reps)
-        bold.append([False] * (1 + len(names)) + is_best + [False] * len(means.columns))
-    of_means = aggregate_means(means, comparison).set_index(["label", "metric"])["value"]
-    by_agent = aggregates.set_index(["agent", "metric"])
-    last = {metric: [with_interval(*by_agent.loc[(agent, metric)]) for agent in matrices] for metric in comparison.metrics}
-    last |= {} if comparison.is_raw else {comparison.above_one: [str(games_above(matrix)) for matrix in matrices.values()]}
-    last["minutes per run"] = [number(comparison.minutes(agent)) for agent in matrices]
-    for name, texts in last.items():
-        ends = ("1", "0") if name == "optimality gap" else ("0", "1") if name in METRICS else ("", "")
-        metric = "above 1" if name == comparison.above_one else name
-        known = [of_means.get((method, metric), np.nan) for method in means]
-        rows.append([name, *ends[: len(names)], *texts, *(number(value, 3 if name in METRICS else 0) for value in known)])
-        is_best = distinct_best(matrices, comparison.differing, reps) if name == "IQM" else [False] * len(matrices)
-        bold.append([False] * (1 + len(names)) + is_best + [False] * len(means.columns))
-    return make_table(header, rows, bold)
+        texts = []
+        for mean, spread in (by_game.loc[(agent, game)] for agent in matrices):
+            texts.append(number(mean) + ("" if np.isnan(spread) else f"\n± {number(spread, decimals_of(mean))}"))
+        rows.append([game, *bounds, *texts, *map(number, means.loc[game])])
+        column = sorted(comparison.games).index(game)
+        best.append(distinct_best({agent: matrix[:, [column]] for agent, matrix in alike.items()}, reps))
+    found = aggregates.set_index(["from", "agent", "metric"])[["value", "low", "high"]]
+    keys = [*(("runs", agent) for agent in matrices), *(("game means only", method) for method in means)]
+    for metric in comparison.metrics:
+        ends = ("1", "0") if metric == "optimality gap" else ("0", "1") if metric in METRICS else ("", "")
+        decimals = 3 if metric in METRICS else 0
+        texts = []
+        for value, low, high in (found.loc[(*key, metric)] for key in keys):
+            interval = "" if np.isnan(low) else f"\n[{number(low, decimals)}, {number(high, decimals)}]"
+            texts.append(number(value, decimals) + interval)
+        rows.append([metric, *ends[: len(names)], *texts])
+        best.append(distinct_best(alike, reps) if metric == "IQM" else None)
+    times = [number(comparison.minutes(agent)) for agent in matrices]
+    rows.append(["minutes per run", *[""] * len(names), *times, *["–"] * len(means.columns)])
+    columns = ["", *[""] * len(names), *matrices, *[""] * len(means.columns)]
+    return make_table(header, rows, [[agent == name for agent in columns] for name in [*best, None]])
 
 
 def difference_table(comparison: Comparison) -> Table:
@@ -170,4 +130,4 @@ def difference_table(comparison: Comparison) -> Table:
                 text += f"\n[{number(ends.low)}, {number(ends.high)}]"
             cells.append(text)
         rows.append([game, *cells])
-    return make_table([f"minus {comparison.label(first)}", *(f"{comparison.label(agent)}" for agent in others)], rows)
+    return make_table([f"minus {comparison.label(first)}", *map(comparison.label, others)], rows)

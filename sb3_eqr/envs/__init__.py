@@ -10,26 +10,22 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_eqr.common.saving.env_state import ResumableWrapper
+from sb3_eqr.envs import minatar
 from sb3_eqr.envs.atari import make_atari100k_env
 from sb3_eqr.envs.blind_cliffwalk import BlindCliffwalk
-from sb3_eqr.envs.minatar import register_minatar
 from sb3_eqr.envs.pixel_pendulum import PixelPendulum
 from sb3_eqr.envs.sliding_ball import SlidingBall
 from sb3_eqr.envs.star_field import StarField
 
 # Keyword arguments for gymnasium.register.
 WORLDS: dict[str, dict[str, Any]] = {
-    "BlindCliffwalk-v0": {"entry_point": "sb3_eqr.envs.blind_cliffwalk:BlindCliffwalk"},
-    "SlidingBall-v0": {"entry_point": "sb3_eqr.envs.sliding_ball:SlidingBall", "max_episode_steps": 100},
-    "SlidingBallTorus-v0": {
-        "entry_point": "sb3_eqr.envs.sliding_ball:SlidingBall",
-        "max_episode_steps": 100,
-        "kwargs": {"dimensions": 2},
-    },
-    "PixelPendulum-v0": {"entry_point": "sb3_eqr.envs.pixel_pendulum:PixelPendulum", "max_episode_steps": 200},
-    "StarField-v0": {"entry_point": "sb3_eqr.envs.star_field:StarField", "max_episode_steps": 100},
+    "BlindCliffwalk-v0": {"entry_point": "sb3_eqr.envs:BlindCliffwalk"},
+    "SlidingBall-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100},
+    "SlidingBallTorus-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100, "kwargs": {"dimensions": 2}},
+    "PixelPendulum-v0": {"entry_point": "sb3_eqr.envs:PixelPendulum", "max_episode_steps": 200},
+    "StarField-v0": {"entry_point": "sb3_eqr.envs:StarField", "max_episode_steps": 100},
     "StarFieldRotations-v0": {
-        "entry_point": "sb3_eqr.envs.star_field:StarField",
+        "entry_point": "sb3_eqr.envs:StarField",
         "max_episode_steps": 100,
         "kwargs": {"translations": False},
     },
@@ -38,18 +34,13 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 def register() -> None:
     """Register the environments above and MinAtar's games with gymnasium (MinAtar needs ``pip install minatar``)."""
-    for env_id, arguments in WORLDS.items():
+    for env_id, arguments in {**WORLDS, **minatar.WORLDS}.items():
         if env_id not in gym.registry:
             gym.register(env_id, **arguments)
-    register_minatar()
 
 
 def import_packages(packages: Iterable[str]) -> None:
-    """
-    Import packages that register environments with gymnasium.
-
-    :raises ValueError: if a package cannot be imported
-    """
+    """Import packages that register environments with gymnasium; raises ValueError if one cannot be imported."""
     for package in packages:
         try:
             importlib.import_module(package)

@@ -33,9 +33,7 @@ class BlindCliffwalk(gym.Env):
         self.state = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
-        """
-        :return: the first state
-        """
+        """:return: the first state, 0, and an empty info"""
         super().reset(seed=seed)
         self.state = 0
         return self.state, {}
@@ -54,9 +52,7 @@ class BlindCliffwalk(gym.Env):
         return self.state, 0.0, False, False, {}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        :return: with ``render_mode="rgb_array"``: (32, 32 n_states, 3), uint8
-        """
+        """:return: with ``render_mode="rgb_array"``: (32, 32 n_states, 3), uint8"""
         if self.render_mode is None:
             return None
         row = np.where(np.arange(self.n_states) == self.state, 255, 60).astype(np.uint8)

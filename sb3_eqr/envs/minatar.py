@@ -5,23 +5,16 @@ import numpy as np
 from gymnasium import spaces
 
 PIXELS = 32  # size of one pixel of the game in the rendered image
-GAMES = {
-    "Asterix": "asterix",
-    "Breakout": "breakout",
-    "Freeway": "freeway",
-    "Seaquest": "seaquest",
-    "SpaceInvaders": "space_invaders",
+GAMES = {game.title().replace("_", ""): game for game in ("asterix", "breakout", "freeway", "seaquest", "space_invaders")}
+# The games under MinAtar's own names, "MinAtar/<Game>-v0" with all six actions and "-v1" with fewer, for gymnasium.register.
+WORLDS = {
+    f"MinAtar/{name}-{version}": {
+        "entry_point": "minatar.gym:BaseEnv",
+        "kwargs": {"game": game, "use_minimal_action_set": minimal},
+    }
+    for name, game in GAMES.items()
+    for version, minimal in (("v0", False), ("v1", True))
 }
-
-
-def register_minatar() -> None:
-    """Register the games under MinAtar's own names: ``MinAtar/<Game>-v0`` with all six actions, ``-v1`` with fewer."""
-    for name, game in GAMES.items():
-        for version, minimal in (("v0", False), ("v1", True)):
-            env_id = f"MinAtar/{name}-{version}"
-            if env_id not in gym.registry:
-                kwargs = {"game": game, "use_minimal_action_set": minimal}
-                gym.register(env_id, entry_point="minatar.gym:BaseEnv", kwargs=kwargs)
 
 
 class ChannelsFirstImage(gym.ObservationWrapper):
@@ -45,9 +38,7 @@ class ChannelsFirstImage(gym.ObservationWrapper):
         return np.moveaxis(observation, 2, 0).astype(np.uint8) * np.uint8(255)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        :return: with ``render_mode="rgb_array"``: (320, 320, 3), uint8; MinAtar itself returns 10×10 floats in [0, 1]
-        """
+        """:return: with ``render_mode="rgb_array"``: (320, 320, 3), uint8; MinAtar itself returns 10×10 floats in [0, 1]"""
         picture = self.env.render()
         if not isinstance(picture, np.ndarray) or self.render_mode != "rgb_array":
             return None

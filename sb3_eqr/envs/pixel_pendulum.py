@@ -3,12 +3,10 @@
 from math import cos, pi, remainder, sin
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_eqr.common.checks.arguments import check, integer, number
-from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, enlarge
+from sb3_eqr.envs.pixels import PixelEnv
 
 # The constants of gymnasium's Pendulum-v1; mass and length are 1.
 GRAVITY = 10.0  # m/s²
@@ -18,7 +16,7 @@ MAX_TORQUE = 2.0  # N m
 FREE_MAX_TORQUE = 5.0  # N m; in one step, this moves the tip of the rod by 0.7 of 48 pixels; 2 N m would move it by 0.3
 
 
-class PixelPendulum(gym.Env):
+class PixelPendulum(PixelEnv):
     """
     A rod that turns about the centre of the image (EqR, §5, Example 1 and Figure 2), with the dynamics of
     gymnasium's Pendulum-v1 and discrete torques.
@@ -29,7 +27,8 @@ class PixelPendulum(gym.Env):
     (θ, ω, u) → (−θ, −ω, −u), negates the torque. With gravity, only the reflection about the vertical remains a symmetry.
 
     The observation is (size, size, 2), uint8: the previous and the current frame, so that the velocity is observable.
-    ``info`` holds the true "angle" and "velocity". No episode terminates.
+    ``info`` holds the true "angle" and "velocity". No episode terminates. Options of ``reset``: {"angle": any angle in
+    radians; "velocity": in [−8, 8] rad/s}. Missing values are drawn uniformly as in Pendulum-v1: from [−π, π] and [−1, 1].
 
     :param gravity: whether gravity acts. If so, torques are at most 2 N m, too weak to lift the rod at once, and the reward
         is that of Pendulum-v1, −(θ² + 0.1 ω² + 0.001 u²) of the state before the step, in [−16.3, 0]. Otherwise torques are
@@ -44,30 +43,18 @@ class PixelPendulum(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20, "periodic": ["angle"]}
 
     def __init__(self, gravity: bool = True, size: int = 48, n_torques: int = 3, render_mode: str | None = None):
-        check("size", size, integer(SMALLEST_PICTURE))
         check("n_torques", n_torques, integer(3))
         if n_torques % 2 == 0:
             raise ValueError(f"n_torques must be odd, so that the middle torque is 0, got {n_torques}.")
-        self.gravity = gravity
-        self.size = size
-        self.render_mode = render_mode
-        self.observation_space = spaces.Box(0, 255, (size, size, 2), np.uint8)
-        self.action_space = spaces.Discrete(n_torques)
         middle = n_torques // 2
         # Not linspace, so that the two halves are exact negatives of each other.
         self.torques = (MAX_TORQUE if gravity else FREE_MAX_TORQUE) * (np.arange(n_torques) - middle) / middle
+        super().__init__(size, 2, [f"{torque:+.3g}" for torque in self.torques], ["angle", "velocity"], render_mode)  # in N m
+        self.gravity = gravity
         self.angle = 0.0
         self.velocity = 0.0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        :param options: {"angle": any angle in radians; "velocity": in [−8, 8] rad/s}. Missing values are drawn uniformly as
-            in Pendulum-v1: from [−π, π] and [−1, 1].
-        :return: observation, (size, size, 2); {"angle": radians, "velocity": rad/s}
-        :raises ValueError: if an option is unknown or its value is invalid
-        """
-        super().reset(seed=seed)
-        options = check_options(options, ["angle", "velocity"])
+    def _begin(self, options: dict[str, Any]) -> None:
         # Always draw both, so that setting one option does not change the other draw.
         drawn = {"angle": self.np_random.uniform(-pi, pi), "velocity": self.np_random.uniform(-1, 1)}
         state = {**drawn, **options}
@@ -75,16 +62,8 @@ class PixelPendulum(gym.Env):
         check("velocity", state["velocity"], number(-MAX_SPEED, MAX_SPEED))
         self.angle = remainder(state["angle"], 2 * pi)
         self.velocity = float(state["velocity"])
-        return self.draw(self.angle, self.velocity), self._info()
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        :param action: index of the torque, 0 … ``n_torques`` − 1
-        :return: observation, (size, size, 2); reward; terminated and truncated, both always ``False``;
-            {"angle": radians, "velocity": rad/s}
-        :raises ValueError: if the action is not in the action space
-        """
-        check_action(self.action_space, action)
+    def _move(self, action: int) -> tuple[float, bool]:
         torque = float(self.torques[action])
         cost = self.angle**2 + 0.1 * self.velocity**2 + 0.001 * torque**2
         weight = 1.5 * GRAVITY * sin(self.angle) if self.gravity else 0.0
@@ -92,10 +71,10 @@ class PixelPendulum(gym.Env):
         self.velocity = min(max(velocity, -MAX_SPEED), MAX_SPEED)
         # remainder, unlike %, is exact and odd, so mirrored states stay mirrored.
         self.angle = remainder(self.angle + self.velocity * TIME_STEP, 2 * pi)
-        return self.draw(self.angle, self.velocity), -cost if self.gravity else 0.0, False, False, self._info()
+        return -cost if self.gravity else 0.0, False
 
-    def _info(self) -> dict[str, Any]:
-        return {"angle": self.angle, "velocity": self.velocity}
+    def _seen(self) -> tuple[np.ndarray, dict[str, Any]]:
+        return self.draw(self.angle, self.velocity), {"angle": self.angle, "velocity": self.velocity}
 
     def draw(self, angle: float, velocity: float) -> np.ndarray:
         """
@@ -103,9 +82,9 @@ class PixelPendulum(gym.Env):
         :param velocity: in rad/s; the previous angle is ``angle`` − 0.05 ``velocity``, which is exact after a step
         :return: the observation in that state, (size, size, 2), uint8
         """
-        return np.stack([self._picture(angle - velocity * TIME_STEP), self._picture(angle)], axis=2)
+        return np.stack([self._rod(angle - velocity * TIME_STEP), self._rod(angle)], axis=2)
 
-    def _picture(self, angle: float) -> np.ndarray:
+    def _rod(self, angle: float) -> np.ndarray:
         """An image of the rod at an angle: (size, size), uint8."""
         along = np.array([-cos(angle), -sin(angle)])  # rows count downwards, so upright is −1
         centred = np.arange(self.size) + 0.5 - self.size / 2
@@ -114,17 +93,3 @@ class PixelPendulum(gym.Env):
         nearest = np.clip(rows * along[0] + columns * along[1], 0, 0.4 * self.size)
         distance = np.hypot(rows - nearest * along[0], columns - nearest * along[1])
         return np.rint(255 * np.clip(self.size / 24 + 0.5 - distance, 0, 1)).astype(np.uint8)
-
-    def get_action_meanings(self) -> list[str]:
-        """
-        :return: the torque of each action, in N m
-        """
-        return [f"{torque:+.3g}" for torque in self.torques]
-
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        :return: with ``render_mode="rgb_array"``: (4 size, 4 size, 3), uint8
-        """
-        if self.render_mode is None:
-            return None
-        return enlarge(self._picture(self.angle)[:, :, None].repeat(3, axis=2))

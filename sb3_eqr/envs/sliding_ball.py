@@ -1,27 +1,25 @@
 """The sliding ball of the paper (Example 2): an environment whose state space is SO(2), or SO(2) × SO(2)."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_eqr.common.checks.arguments import check, integer
+from sb3_eqr.envs.pixels import PixelEnv, check_position
 
-SMALLEST_PICTURE = 36  # smallest image that the default convolutions of CnnPolicy accept
-ENLARGED = 4  # scale factor from an observation to a rendered image
 DISTRACTOR_BRIGHTNESS = 0.8  # relative to the ball
 
 
-class SlidingBall(gym.Env):
+class SlidingBall(PixelEnv):
     """
     A ball on a closed loop (EqR, §5, Example 2 and Figure 3): it leaves the image at one edge and re-enters at the
     opposite one. The paper uses one dimension; with two, the state space is a torus. Each action rotates one axis by
     2π / ``n_steps``, independently of the position: SO(2) per axis.
 
     The observation is (size, size, 1), uint8: a white disc of radius size/8 on a black background, wrapped at the edges.
-    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state.
+    Actions: 0 up, 1 down, and on the torus 2 left, 3 right. ``info["position"]`` is the true state. Option of ``reset``:
+    {"position": ``dimensions`` numbers in [0, 1)}, drawn uniformly if not given.
 
     Distractors are light grey discs of the same size behind the ball. At every step, each jumps to a random place: they carry
     no information and cannot be predicted, so the state space and its symmetry are the same, but the ball is harder to see.
@@ -49,36 +47,23 @@ class SlidingBall(gym.Env):
         render_mode: str | None = None,
     ):
         check("dimensions", dimensions, integer(1, 2))
-        check("size", size, integer(SMALLEST_PICTURE))
+        super().__init__(size, 1, ["UP", "DOWN", "LEFT", "RIGHT"][: 2 * dimensions], ["position"], render_mode)
         check("n_steps", n_steps, integer(3))
         check("n_distractors", n_distractors, integer(0))
         self.dimensions = dimensions
-        self.size = size
         self.n_steps = n_steps
         self.goal = None if goal is None else check_position("goal", goal, dimensions)
         self.n_distractors = n_distractors
-        self.render_mode = render_mode
-        self.observation_space = spaces.Box(0, 255, (size, size, 1), np.uint8)
-        self.action_space = spaces.Discrete(2 * dimensions)
         self._distractors = np.zeros((n_distractors, dimensions))  # their positions, drawn at every step
         self._start = np.zeros(dimensions)
         self._moved = np.zeros(dimensions, dtype=np.int64)  # steps since the start: integers, so that a full turn is exact
 
     @property
     def position(self) -> np.ndarray:
-        """
-        :return: (dimensions,), fractions of the loop in [0, 1), measured from the top edge and from the left edge
-        """
+        """:return: (dimensions,), fractions of the loop in [0, 1), measured from the top edge and from the left edge"""
         return np.mod(self._start + self._moved / self.n_steps, 1.0)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        :param options: {"position": initial position, ``dimensions`` numbers in [0, 1)}; drawn uniformly if not given
-        :return: observation, (size, size, 1); {"position": (dimensions,)}
-        :raises ValueError: if an option is unknown or its value is invalid
-        """
-        super().reset(seed=seed)
-        options = check_options(options, ["position"])
+    def _begin(self, options: dict[str, Any]) -> None:
         self._moved[:] = 0
         if "position" in options:
             self._start = check_position("position", options["position"], self.dimensions)
@@ -87,36 +72,25 @@ class SlidingBall(gym.Env):
             while self._at_goal():
                 self._start = self.np_random.random(self.dimensions)
         self._move_distractors()
-        return self.draw(self.position), {"position": self.position}
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        :param action: 0 up, 1 down, 2 left, 3 right
-        :return: observation, (size, size, 1); reward, 1 at the goal and 0 elsewhere; terminated, whether the ball is at the
-            goal; truncated, always ``False``; {"position": (dimensions,)}
-        :raises ValueError: if the action is not in the action space
-        """
-        check_action(self.action_space, action)
-        axis, forwards = divmod(int(action), 2)
+    def _move(self, action: int) -> tuple[float, bool]:
+        axis, forwards = divmod(action, 2)
         self._moved[axis] = (self._moved[axis] + 2 * forwards - 1) % self.n_steps
-        there = self._at_goal()
         self._move_distractors()
-        return self.draw(self.position), float(there), there, False, {"position": self.position}
+        there = self._at_goal()
+        return float(there), there
 
     def _move_distractors(self) -> None:
         self._distractors = self.np_random.random((self.n_distractors, self.dimensions))
-
-    def get_action_meanings(self) -> list[str]:
-        """
-        :return: the name of each action, as in ALE's environments
-        """
-        return ["UP", "DOWN", "LEFT", "RIGHT"][: 2 * self.dimensions]
 
     def _at_goal(self) -> bool:
         if self.goal is None:
             return False
         way = np.abs(self.position - self.goal)
         return bool(np.all(np.minimum(way, 1 - way) <= 0.5 / self.n_steps))
+
+    def _seen(self) -> tuple[np.ndarray, dict[str, Any]]:
+        return self.draw(self.position), {"position": self.position}
 
     def draw(self, position: Sequence[float] | np.ndarray) -> np.ndarray:
         """
@@ -139,60 +113,9 @@ class SlidingBall(gym.Env):
         rows, columns = np.minimum(way, self.size - way)
         return np.hypot(rows[:, None], columns[None, :])
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        :return: with ``render_mode="rgb_array"``: (4 size, 4 size, 3), uint8
-        """
-        if self.render_mode is None:
-            return None
-        picture = self.draw(self.position).repeat(3, axis=2)
+    def _picture(self) -> np.ndarray:
+        picture = super()._picture()
         if self.goal is not None:
             ring = np.clip(1.5 - np.abs(self._distance(self.goal) - self.size / 8), 0, 1)
             picture[:, :, 1] = np.maximum(picture[:, :, 1], np.rint(110 * ring).astype(np.uint8))
-        return enlarge(picture)
-
-
-def check_position(name: str, position: Sequence[float] | np.ndarray, dimensions: int) -> np.ndarray:
-    """
-    :param name: name of the argument
-    :param position: fractions of a closed loop, one per axis
-    :param dimensions: number of axes
-    :return: a copy, (dimensions,)
-    :raises ValueError: if ``position`` is not ``dimensions`` numbers in [0, 1)
-    """
-    found = np.array(position)
-    legal = found.shape == (dimensions,) and np.issubdtype(found.dtype, np.number) and np.isrealobj(found)
-    if not legal or not np.all((found >= 0) & (found < 1)):
-        raise ValueError(f"{name} must be an array of shape ({dimensions},) with values in [0, 1), got {position!r}.")
-    return found.astype(np.float64)
-
-
-def check_options(options: dict[str, Any] | None, names: Iterable[str]) -> dict[str, Any]:
-    """
-    :param options: options of ``reset``
-    :param names: legal option names
-    :return: the options, an empty dict for ``None``
-    :raises ValueError: if an option is unknown
-    """
-    unknown = set(options or {}) - set(names)
-    if unknown:
-        raise ValueError(f"options must only contain {', '.join(names)}, got {', '.join(map(repr, sorted(unknown)))}.")
-    return dict(options or {})
-
-
-def check_action(space: spaces.Space, action: Any) -> None:
-    """
-    :param space: the action space
-    :param action: a number or, as returned by SB3's ``predict``, an array of shape ()
-    :raises ValueError: if the action is not in the space
-    """
-    if not space.contains(action):
-        raise ValueError(f"action must be in {space}, got {action!r}.")
-
-
-def enlarge(picture: np.ndarray) -> np.ndarray:
-    """
-    :param picture: (height, width, 3)
-    :return: (4 height, 4 width, 3)
-    """
-    return picture.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
+        return picture

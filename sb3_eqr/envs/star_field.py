@@ -3,21 +3,21 @@
 from math import cos, pi, sin
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_eqr.common.checks.arguments import check, integer
-from sb3_eqr.envs.sliding_ball import SMALLEST_PICTURE, check_action, check_options, check_position, enlarge
+from sb3_eqr.envs.pixels import PixelEnv, check_position
 
 TURN = pi / 16  # rad, about 0.2; 32 turns make a full one
 MOVE = 0.05  # fraction of the cube's side; 20 moves along an edge lead back to the start
 STAR_RADIUS = 0.04  # fraction of the cube's side
 VIEW = 0.5  # range of the camera, as a fraction of the side: beyond it, another copy of a star would be nearer
 NEAR = 0.05  # stars nearer to the camera than this are invisible; up to twice this distance they fade
+TURNS = ["PITCH UP", "PITCH DOWN", "YAW RIGHT", "YAW LEFT", "ROLL RIGHT", "ROLL LEFT"]
+MOVES = ["FORWARD", "BACK", "RIGHT", "LEFT", "UP", "DOWN"]
 
 
-class StarField(gym.Env):
+class StarField(PixelEnv):
     """
     A camera among coloured balls at fixed positions in a periodic cube of side 1. Only the nearest copy of each ball is
     visible, and light fades to zero at half the side, so the camera can fly on forever and no ball pops up.
@@ -30,7 +30,9 @@ class StarField(gym.Env):
 
     Actions: 0 pitch up, 1 pitch down, 2 yaw right, 3 yaw left, 4 roll right (clockwise), 5 roll left, each by π/16 rad;
     and with translations 6 forward, 7 back, 8 right, 9 left, 10 up, 11 down, each by 0.05.
-    ``info`` holds the true "rotation", (3, 3), and "translation", (3,). The reward is 0 and no episode terminates.
+    ``info`` holds the true "rotation", (3, 3), and "translation", (3,). The reward is 0 and no episode terminates. Options of
+    ``reset``: {"rotation": (3, 3); "translation": three numbers in [0, 1), only if ``translations``}. Missing values are drawn
+    uniformly.
 
     :param translations: ``False``: SO(3) only; the camera stays in the middle of the cube
     :param size: height and width of the image, in pixels; at least 36
@@ -50,14 +52,11 @@ class StarField(gym.Env):
         layout_seed: int = 0,
         render_mode: str | None = None,
     ):
-        check("size", size, integer(SMALLEST_PICTURE))
+        actions, options = (TURNS + MOVES, ["rotation", "translation"]) if translations else (TURNS, ["rotation"])
+        super().__init__(size, 3, actions, options, render_mode)
         check("n_stars", n_stars, integer(1))
         check("layout_seed", layout_seed, integer(0))
         self.translations = translations
-        self.size = size
-        self.render_mode = render_mode
-        self.observation_space = spaces.Box(0, 255, (size, size, 3), np.uint8)
-        self.action_space = spaces.Discrete(12 if translations else 6)
         layout = np.random.default_rng(layout_seed)
         self.places = layout.random((n_stars, 3))
         colours = layout.uniform(0.2, 1, (n_stars, 3))
@@ -68,43 +67,25 @@ class StarField(gym.Env):
         self._turns = [axis_rotation(axis, sign * TURN) for axis in range(3) for sign in (1, -1)]
         self._moves = MOVE * np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, 1, 0]])
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        :param options: {"rotation": (3, 3); "translation": three numbers in [0, 1), only if ``translations``}.
-            Missing values are drawn uniformly.
-        :return: observation, (size, size, 3); {"rotation": (3, 3), "translation": (3,)}
-        :raises ValueError: if an option is unknown or its value is invalid
-        """
-        super().reset(seed=seed)
-        options = check_options(options, ["rotation", "translation"] if self.translations else ["rotation"])
+    def _begin(self, options: dict[str, Any]) -> None:
         # Always draw both, so that setting one option does not change the other draw.
         quaternion, place = self.np_random.standard_normal(4), self.np_random.random(3)
         given = options.get("rotation")
-        self.rotation = quaternion_rotation(quaternion) if given is None else check_rotation("rotation", given)
+        self.rotation = quaternion_rotation(quaternion) if given is None else check_rotation(given)
         if self.translations:
             self.translation = check_position("translation", options.get("translation", place), 3)
-        return self.draw(self.rotation, self.translation), self._info()
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        :param action: see above, 0 … 5 or 0 … 11
-        :return: observation, (size, size, 3); reward, always 0; terminated and truncated, both always ``False``;
-            {"rotation": (3, 3), "translation": (3,)}
-        :raises ValueError: if the action is not in the action space
-        """
-        check_action(self.action_space, action)
-        self._move(int(action))
-        return self.draw(self.rotation, self.translation), 0.0, False, False, self._info()
-
-    def _move(self, action: int) -> None:
+    def _move(self, action: int) -> tuple[float, bool]:
         if action < len(self._turns):
             self.rotation = orthonormalized(self.rotation @ self._turns[action])
         else:
             moved = self.translation + self.rotation @ self._moves[action - len(self._turns)]
             self.translation = np.mod(np.mod(moved, 1), 1)  # twice, because one call maps a tiny negative number to 1.0
+        return 0.0, False
 
-    def _info(self) -> dict[str, Any]:
-        return {"rotation": self.rotation.copy(), "translation": self.translation.copy()}
+    def _seen(self) -> tuple[np.ndarray, dict[str, Any]]:
+        info = {"rotation": self.rotation.copy(), "translation": self.translation.copy()}
+        return self.draw(self.rotation, self.translation), info
 
     def draw(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """
@@ -135,32 +116,11 @@ class StarField(gym.Env):
         squares = (centred - y[:, None])[:, :, None] ** 2 + (centred - x[:, None])[:, None, :] ** 2
         return np.clip(radius[:, None, None] + 0.5 - np.sqrt(squares), 0, 1)
 
-    def get_action_meanings(self) -> list[str]:
-        """
-        :return: the name of each action, as in ALE's environments
-        """
-        turns = ["PITCH UP", "PITCH DOWN", "YAW RIGHT", "YAW LEFT", "ROLL RIGHT", "ROLL LEFT"]
-        moves = ["FORWARD", "BACK", "RIGHT", "LEFT", "UP", "DOWN"]
-        return (turns + moves)[: int(self.action_space.n)]  # type: ignore[attr-defined]
-
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        :return: with ``render_mode="rgb_array"``: (4 size, 4 size, 3), uint8
-        """
-        return None if self.render_mode is None else enlarge(self.draw(self.rotation, self.translation))
-
 
 def axis_rotation(axis: int, angle: float) -> np.ndarray:
-    """
-    :param axis: 0, 1 or 2
-    :param angle: in radians, right-handed
-    :return: the rotation about that axis, (3, 3)
-    """
-    rotation = np.eye(3)
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    rotation[first, first] = rotation[second, second] = cos(angle)
-    rotation[second, first], rotation[first, second] = sin(angle), -sin(angle)
-    return rotation
+    """:return: the right-handed rotation about axis 0, 1 or 2 by an angle in radians, (3, 3)"""
+    about_first = np.array([[1, 0, 0], [0, cos(angle), -sin(angle)], [0, sin(angle), cos(angle)]])
+    return np.roll(about_first, axis, axis=(0, 1))
 
 
 def quaternion_rotation(quaternion: np.ndarray) -> np.ndarray:
@@ -186,15 +146,13 @@ def orthonormalized(matrix: np.ndarray) -> np.ndarray:
     return 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
 
 
-def check_rotation(name: str, rotation: Any) -> np.ndarray:
+def check_rotation(rotation: Any) -> np.ndarray:
     """
-    :param name: name of the argument
-    :param rotation: its value
     :return: a copy, (3, 3)
     :raises ValueError: if it is not a rotation matrix to six digits
     """
     found = np.array(rotation, dtype=np.float64)
     legal = found.shape == (3, 3) and np.allclose(found.T @ found, np.eye(3), atol=1e-6) and np.linalg.det(found) > 0
     if not legal:
-        raise ValueError(f"{name} must be a (3, 3) rotation matrix, orthonormal with determinant 1, got {rotation!r}.")
+        raise ValueError(f"rotation must be a (3, 3) rotation matrix, orthonormal with determinant 1, got {rotation!r}.")
     return orthonormalized(found)

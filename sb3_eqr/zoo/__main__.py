@@ -1,16 +1,19 @@
 """The command line: thin wrappers of RL Zoo's functions."""
 
 import argparse
+import errno
 import importlib
 import pathlib
 import runpy
 import sys
-from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import yaml
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import StoreDict, get_model_path
+from rl_zoo3 import train
+from rl_zoo3.utils import ALGOS, StoreDict, get_model_path
 
 from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.checkpoints import read_manifest
@@ -18,28 +21,20 @@ from sb3_eqr.common.saving.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import check_algo, check_device, check_environment, check_loggers, check_trained_agent, fail
+from sb3_eqr.zoo.checks import check_device, check_environment, check_loggers, check_trained_agent, fail, failing
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 from sb3_eqr.zoo.registration import trust_files
+from sb3_eqr.zoo.resuming import ResumableExperiment, checkpoints_of, config_of
 
-# The functions and modules of rl_zoo3 behind each command.
-FUNCTIONS = {
-    "train": "rl_zoo3.train:train",
-    "enjoy": "rl_zoo3.enjoy:enjoy",
-    "plot_train": "rl_zoo3.plots.plot_train:plot_train",
-    "plot_from_file": "rl_zoo3.plots.plot_from_file:plot_from_file",
-    "all_plots": "rl_zoo3.plots.all_plots:all_plots",
-}
-MODULES = {
-    "record_video": "rl_zoo3.record_video",
-    "push_to_hub": "rl_zoo3.push_to_hub",
-    "load_from_hub": "rl_zoo3.load_from_hub",
-}
-COMMANDS = [*FUNCTIONS, *MODULES]
+# Each command is a module of RL Zoo with a function of the same name, or a script.
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
+SCRIPTS = ("record_video", "push_to_hub", "load_from_hub")
+COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
+ALL_COMMANDS = (*COMMANDS, "benchmark", "visualize")
 LOADING = ("enjoy", "record_video", "push_to_hub")
 # Errors of RL Zoo that may have a cause which the user can remove.
-MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, FileNotFoundError)
+MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, OSError)
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 
 # Packages of the extra "zoo".
@@ -48,7 +43,7 @@ EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas",
 RESUMING = """train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's
 folder, and --resume FOLDER, which resumes a run from its last one; add --trust if its settings contain Python objects
 """
-USAGE = f"""usage: sb3-eqr {{{",".join(COMMANDS)},benchmark,visualize}} ...
+USAGE = f"""usage: sb3-eqr {{{",".join(ALL_COMMANDS)}}} ...
 
 All commands except the last two take RL Zoo's arguments: sb3-eqr train --help
 {RESUMING}benchmark compares agents over games and seeds: sb3-eqr benchmark --help
@@ -58,7 +53,6 @@ push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothi
 
 def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
     """
-    :param algo: value of ``--algo``
     :param conf_file: value of ``--conf-file``: a path, or the name of one of our files
     :return: the file to use; ``None``: RL Zoo's
     """
@@ -70,12 +64,18 @@ def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
     return conf_file
 
 
+def own_parser() -> argparse.ArgumentParser:
+    """A parser of the arguments that RL Zoo does not have."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--checkpoint-every", type=int)
+    parser.add_argument("--resume", type=pathlib.Path)
+    parser.add_argument("--trust", action="store_true")
+    return parser
+
+
 def parse(arguments: list[str]) -> argparse.Namespace:
-    """
-    :param arguments: arguments of ``train`` or of a command that loads an agent
-    :return: the arguments checked here; RL Zoo parses all arguments again
-    """
-    parser = argparse.ArgumentParser(add_help=False)
+    """:return: the arguments that are checked here; RL Zoo parses all arguments again"""
+    parser = argparse.ArgumentParser(add_help=False, parents=[own_parser()])
     parser.add_argument("--algo")
     parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
     parser.add_argument("--env", default="CartPole-v1")
@@ -93,34 +93,14 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--load-last-checkpoint", action="store_true")
     parser.add_argument("--seed", type=int, default=-1)
     parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
-    add_resuming(parser)
     try:
         return parser.parse_known_args(arguments)[0]
     except (NameError, SyntaxError) as error:
         fail(f"--hyperparams must be key:value with Python values (strings in quotes), got an invalid one: {error}")
 
 
-def add_resuming(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``train`` that RL Zoo does not have."""
-    parser.add_argument("--checkpoint-every", type=int)
-    parser.add_argument("--resume", type=pathlib.Path)
-    parser.add_argument("--trust", action="store_true")
-
-
-def without_gym_packages(arguments: list[str]) -> list[str]:
-    """:return: the arguments without --gym-packages and its values"""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--gym-packages", nargs="+")
-    return parser.parse_known_args(arguments)[1]
-
-
 def prepare_training(args: argparse.Namespace) -> str | None:
-    """
-    Check all arguments before RL Zoo starts.
-
-    :param args: arguments of ``train``
-    :return: the file of hyperparameters to use; ``None``: RL Zoo's
-    """
+    """Check the arguments of ``train``. Returns the file of hyperparameters to use; ``None``: RL Zoo's."""
     algo = args.algo or "ppo"
     path = find_hyperparameters(algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
@@ -130,51 +110,34 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     check_loggers(args.track, args.tensorboard_log)
     check_trained_agent(args.trained_agent)
     if args.trained_agent and not args.trust:
-        statistics = pathlib.Path(args.trained_agent).parent / EnvironmentName(args.env) / "vecnormalize.pkl"
-        check_files(lambda: check_statistics(statistics))
+        with failing():
+            check_statistics(pathlib.Path(args.trained_agent).parent / EnvironmentName(args.env) / "vecnormalize.pkl")
     if path is None:
         check_entry(args.hyperparams, algo, "--hyperparams")
         return None
     if args.resume is not None and args.conf_file is None:
-        path = settings_of_run(args) or path
+        with failing("--resume: "):
+            of_run = config_of(args.resume, args.trust, args.gym_packages)
+        path = path if of_run is None else write_entry(args, of_run)
     entry = read_entry(path, args.env, args.hyperparams)
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
     name = entry_name(read_file(path), args.env, args.hyperparams)
-    if name.startswith("default-"):  # RL Zoo would use "default"
-        file = temporary_folder() / f"{args.algo}.yml"
-        file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
-        print(f"Using the entry {name!r} of {path}")
-        return str(file)
-    return path
+    if not name.startswith("default-"):  # RL Zoo would use "default"
+        return path
+    print(f"Using the entry {name!r} of {path}")
+    return write_entry(args, entry)
 
 
-def settings_of_run(args: argparse.Namespace) -> str | None:
-    """:return: a file with the entry of the run to resume, from the files in its folder; ``None`` if they are not there"""
-    from sb3_eqr.zoo.resuming import config_of
-
-    try:
-        entry = config_of(args.resume, args.trust, args.gym_packages)
-    except ValueError as error:
-        fail(f"--resume: {error}")
-    if entry is None:
-        return None
+def write_entry(args: argparse.Namespace, entry: dict[str, Any]) -> str:
+    """:return: a new file with an entry for the environment"""
     file = temporary_folder() / f"{args.algo}.yml"
     file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
     return str(file)
 
 
-def without_resuming(arguments: list[str]) -> list[str]:
-    """:return: the arguments for RL Zoo's parser"""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    add_resuming(parser)
-    return parser.parse_known_args(arguments)[1]
-
-
 def prepare_resuming(args: argparse.Namespace) -> list[str]:
     """Check ``--checkpoint-every`` and ``--resume`` of ``train``, and make RL Zoo apply them. Returns arguments to add."""
-    from sb3_eqr.zoo import resuming
-
     is_asked = args.checkpoint_every is not None or args.resume is not None
     if is_asked and args.algo not in AGENTS:
         fail(f"--algo must be {' or '.join(AGENTS)} with --checkpoint-every or --resume, got {args.algo}.")
@@ -186,12 +149,12 @@ def prepare_resuming(args: argparse.Namespace) -> list[str]:
     if args.resume is not None:
         if args.hyperparams or args.trained_agent or args.seed != -1:
             fail("--resume uses the settings and seed of the run: leave out --hyperparams, --trained-agent and --seed.")
-        try:
-            _, manifest = read_manifest(resuming.checkpoints_of(args.resume))
-        except ValueError as error:
-            fail(f"--resume: {error}")
+        with failing("--resume: "):
+            _, manifest = read_manifest(checkpoints_of(args.resume))
         seed = manifest["settings"].get("seed")
-    resuming.install(args.checkpoint_every, args.resume, args.trust)
+    train.ExperimentManager = partial(  # type: ignore[misc, assignment]
+        ResumableExperiment, checkpoint_every=args.checkpoint_every, resume=args.resume, trust=args.trust
+    )
     return [] if seed is None else ["--seed", str(seed)]  # RL Zoo shows and stores it, and would draw one
 
 
@@ -201,44 +164,33 @@ def check_runs(arguments: list[str]) -> None:
     for flags in (("-a", "--algos"), ("-e", "--env"), ("-f", "--exp-folders")):
         parser.add_argument(*flags, nargs="+", default=[])
     args = parser.parse_known_args(arguments)[0]
+    if not (args.algos and args.env and args.exp_folders):
+        fail("all_plots needs -a ALGO ..., -e ENV ... and -f FOLDER ..., the folder given to train.")
     places = [pathlib.Path(folder) / algo for folder in args.exp_folders for algo in args.algos]
-    if args.env and places and not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
+    if not any(any(place.glob(f"{env}*")) for place in places for env in args.env):
         fail(f"all_plots needs runs on {', '.join(args.env)} in {', '.join(map(str, places))}, got none.")
 
 
 def check_trained(args: argparse.Namespace) -> None:
     """Exit with a message if there is no trained agent at the given place, or if the files beside it would run code."""
+    algo, name = args.algo or "ppo", EnvironmentName(args.env)
+    which = (args.load_best, args.load_checkpoint, args.load_last_checkpoint)
     try:
-        *_, folder = get_model_path(
-            args.exp_id,
-            args.folder,
-            args.algo or "ppo",
-            EnvironmentName(args.env),
-            args.load_best,
-            args.load_checkpoint,
-            args.load_last_checkpoint,
-        )
+        *_, folder = get_model_path(args.exp_id, args.folder, algo, name, *which)
     except (AssertionError, ValueError) as error:
-        runs = pathlib.Path(args.folder, args.algo or "ppo").glob(f"{EnvironmentName(args.env)}_*/*.zip")
+        runs = pathlib.Path(args.folder, algo).glob(f"{name}_*/*.zip")
         places = {run.parent.name.rpartition("_")[2]: run for run in runs}
         ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
-        found = "Pass -f with the folder given to train (logs by default), or train one first."
         if ids:
             found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."
-        if places and not ids:
+        elif places:
             found = f"Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."
+        else:
+            found = "Pass -f with the folder given to train (logs by default), or train one first."
         fail(f"{error}. {found}")
-    beside = pathlib.Path(folder, EnvironmentName(args.env))
     if args.algo in AGENTS and not args.trust:
-        check_files(lambda: check_zoo_folder(beside, args.gym_packages))
-
-
-def check_files(check: Callable[[], None]) -> None:
-    """Exit with a message if files from others are refused."""
-    try:
-        check()
-    except ValueError as error:
-        fail(str(error))
+        with failing():
+            check_zoo_folder(pathlib.Path(folder, name), args.gym_packages)
 
 
 def save_where_nothing_is_shown(command: str) -> None:
@@ -256,19 +208,16 @@ def save_where_nothing_is_shown(command: str) -> None:
 
 
 def run(command: str, arguments: list[str]) -> None:
-    """
-    :param command: one of ``COMMANDS``
-    :param arguments: RL Zoo's command-line arguments
-    """
+    """Run a command of RL Zoo with these arguments."""
     sys.argv = [f"sb3-eqr {command}", *arguments]
+    module = f"rl_zoo3.plots.{command}" if command in PLOTS else f"rl_zoo3.{command}"
     try:
         if command in PLOTS:
             save_where_nothing_is_shown(command)
-        if command in MODULES:
-            runpy.run_module(MODULES[command], run_name="__main__")
+        if command in SCRIPTS:
+            runpy.run_module(module, run_name="__main__")
         else:
-            module, function = FUNCTIONS[command].split(":")
-            getattr(importlib.import_module(module), function)()
+            getattr(importlib.import_module(module), command)()
     except (*MISTAKES, gym.error.DependencyNotInstalled) as error:
         message = explanation(command, error)
         if message is None:
@@ -281,6 +230,8 @@ def explanation(command: str, error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         return f"{command}: {error}.{advice}"
+    if isinstance(error, OSError) and error.errno in UNWRITABLE:
+        return f"{command}: {error}. Free some space, or pass another folder with -f."
     if "pass trust=True" in str(error) or str(error).startswith("observation_space"):
         return f"{command}: {error}"
     if isinstance(error, gym.error.DependencyNotInstalled):
@@ -303,21 +254,21 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
         check_runs(arguments)
     if command in PLOTS:
         return arguments
-    args = parse(arguments)
-    if args.algo is not None:
-        check_algo(args.algo)
+    args, own = parse(arguments), own_parser()
+    if args.algo is not None and args.algo not in ALGOS:
+        fail(f"--algo must be one of {', '.join(ALGOS)}, got {args.algo!r}.{nearest(args.algo, ALGOS)}")
     if command == "train":
         path = prepare_training(args)
-        arguments = [*without_resuming(arguments), *prepare_resuming(args)]
+        arguments = [*own.parse_known_args(arguments)[1], *prepare_resuming(args)]
         arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
     elif command in LOADING and args.algo is not None:
         check_device(args.device)
         check_environment(args.env, args.gym_packages)  # imports the packages, for which two commands have no argument
-        arguments = without_gym_packages(arguments)
+        own.add_argument("--gym-packages", nargs="+")
+        arguments = own.parse_known_args(arguments)[1]
         downloads = command == "enjoy" and args.folder.rstrip("/") == DOWNLOADS and args.algo not in AGENTS
         if not downloads:
             check_trained(args)
-        arguments = without_resuming(arguments)
     if args.trust and args.algo in AGENTS:
         trust_files(args.algo)
     return arguments
@@ -330,10 +281,7 @@ def main() -> None:
         return
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in COMMANDS:
-        fail(
-            f"The command must be one of {', '.join(COMMANDS)}, benchmark, visualize, got {command!r}."
-            f"{nearest(command, [*COMMANDS, 'benchmark', 'visualize'])}"
-        )
+        fail(f"The command must be one of {', '.join(ALL_COMMANDS)}, got {command!r}.{nearest(command, ALL_COMMANDS)}")
     register()
     if command.endswith("_hub"):
         from sb3_eqr.zoo import hub

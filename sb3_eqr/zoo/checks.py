@@ -3,22 +3,18 @@
 import importlib.util
 import pathlib
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 import gymnasium as gym
 import torch as th
-from rl_zoo3.utils import ALGOS
 
 from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.envs import import_packages
 
 # Prefix of an environment's name -> package that it needs, and how to install it.
-EXTRAS = {
-    "ALE/": ("ale_py", '".[atari]" in a clone of the repository'),
-    "MinAtar/": ("minatar", "minatar"),
-}
-
-
+EXTRAS = {"ALE/": ("ale_py", '".[atari]" in a clone of the repository'), "MinAtar/": ("minatar", "minatar")}
 SIMILAR = 0.8  # for names of environments: "-v0" alone makes any two alike
 
 
@@ -28,18 +24,19 @@ def fail(message: str) -> NoReturn:
     raise SystemExit(2)
 
 
-def check_algo(algo: str) -> None:
-    """Exit with a message if the algorithm is unknown."""
-    if algo not in ALGOS:
-        fail(f"--algo must be one of {', '.join(ALGOS)}, got {algo!r}.{nearest(algo, ALGOS)}")
+@contextmanager
+def failing(start: str = "", errors: tuple[type[Exception], ...] = (ValueError,)) -> Iterator[None]:
+    """Exit with ``start`` and the message of an error instead of raising it."""
+    try:
+        yield
+    except errors as error:
+        fail(f"{start}{error}")
 
 
 def check_environment(env_id: str, packages: list[str]) -> None:
     """Exit with a message if the environment is not registered after these packages are imported."""
-    try:
+    with failing():
         import_packages(packages)
-    except ValueError as error:
-        fail(str(error))
     for start, (package, requirement) in EXTRAS.items():
         is_meant = env_id.startswith(start) or (start == "ALE/" and "NoFrameskip" in env_id)
         if is_meant and importlib.util.find_spec(package) is None:

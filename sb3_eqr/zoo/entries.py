@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import inspect
 import pathlib
+import runpy
 from typing import Any
 
 import gymnasium as gym
@@ -17,39 +18,15 @@ from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, T
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
+from sb3_eqr.envs.pixels import SMALLEST_PICTURE
 from sb3_eqr.trust import wrapper_names
-from sb3_eqr.zoo.checks import fail
+from sb3_eqr.zoo.checks import fail, failing
 
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
 # Arguments that RL Zoo itself passes to the constructor, and their flags.
-FLAGS = {
-    "env": "--env",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
-    "tensorboard_log": "--tensorboard-log",
-    "_init_setup_model": "nothing",
-}
-
-
-def is_text_of_number(value: Any) -> bool:
-    """Whether the value is a number that was read as text, as YAML reads 1e5."""
-    try:
-        return isinstance(value, str) and np.isfinite(float(value))
-    except ValueError:
-        return False
-
-
-def is_schedule(value: Any) -> bool:
-    """Whether RL Zoo converts the value to a schedule: "lin_1e-3" decreases linearly to 0."""
-    try:
-        return isinstance(value, str) and value.startswith("lin_") and float(value.removeprefix("lin_")) >= 0
-    except ValueError:
-        return False
-
-
-SMALLEST_IMAGE = 36  # pixels: what the convolutions of the "default-image" entries need
+FLAGS = {key: f"--{key.replace('_', '-')}" for key in ("env", "seed", "device", "verbose", "tensorboard_log")}
+FLAGS["_init_setup_model"] = "nothing"
 # Values that RL Zoo itself reads.
 RULES = {
     "n_timesteps": number(0, above=True),
@@ -58,8 +35,17 @@ RULES = {
     "learning_starts": number(0) | NONE,
     "buffer_size": number(1),
     "normalize": FLAG | TEXT | DICTIONARY,
-    "learning_rate": number(0) | Rule("lin_ and a number", is_schedule),
+    # RL Zoo converts "lin_1e-3" to a schedule that decreases linearly to 0.
+    "learning_rate": number(0) | Rule("lin_ and a number", lambda value: number_in(value, "lin_") >= 0),
 }
+
+
+def number_in(value: Any, start: str = "") -> float:
+    """The number in a text that begins with ``start``; NaN if the value is no such text."""
+    try:
+        return float(value.removeprefix(start)) if isinstance(value, str) and value.startswith(start) else np.nan
+    except ValueError:
+        return np.nan
 
 
 def read_file(path: str) -> dict[str, Any]:
@@ -72,17 +58,12 @@ def read_file(path: str) -> dict[str, Any]:
             names = ", ".join(configuration_files())
             fail(f"--conf-file must be a YAML file, a Python file or package, or one of {names}, got {path!r}.")
         return importlib.import_module(path).hyperparams
-    file = pathlib.Path(path)
-    if not file.is_file():
+    if not pathlib.Path(path).is_file():
         fail(f"--conf-file: there is no file {path!r}.{nearest(path, configuration_files())}")
     if path.endswith(".py"):
-        found: dict[str, Any] = {}
-        exec(file.read_text(encoding="utf-8"), found)
-        return found["hyperparams"]
-    try:
-        entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        fail(f"{path} must be valid YAML: {error}")
+        return runpy.run_path(path)["hyperparams"]
+    with failing(f"{path} must be valid YAML: ", (yaml.YAMLError,)):
+        entries = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8")) or {}
     if not isinstance(entries, dict):
         fail(f"{path} must be a mapping from environments to entries, got {entries!r:.60}.")
     return entries
@@ -91,7 +72,6 @@ def read_file(path: str) -> dict[str, Any]:
 def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) -> str:
     """
     :param entries: entries of a file
-    :param env_id: the environment
     :param changes: changes of the entry, which may wrap the environment
     :return: its own name, "atari", or that of a generic entry: "default", or "default-image", "default-small-image" or
         "default-dict" if the file has them and the observations are images or dicts (RL Zoo itself knows only "default");
@@ -103,24 +83,20 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
         return "atari"
     if not any(name.startswith("default-") for name in entries):
         return "default"
-    try:
+    with failing(f"{env_id}: ", (ValueError, TypeError, ImportError, AttributeError)):
         env = gym.make(env_id, **(changes.get("env_kwargs") or {}))
         wrap = get_wrapper_class(changes) if changes.get("env_wrapper") else None
         space = (env if wrap is None else wrap(env)).observation_space
-    except (ValueError, TypeError, ImportError, AttributeError) as error:
-        fail(f"{env_id}: {error}")
     env.close()
     if isinstance(space, gym.spaces.Dict):
         return "default-dict"
     if not is_image_space(space):
         return "default"
-    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_IMAGE else "default-image"
+    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_PICTURE else "default-image"
 
 
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:
     """
-    :param path: path of the file
-    :param env_id: the environment
     :param changes: changes from the command line
     :return: the entry as in the file, with the changes; exits with a message if there is none
     """
@@ -150,11 +126,10 @@ def read_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
 
 def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     """
-    Exit with a message if a key is not an argument of the constructor, or a wrapper does not work with our agents.
+    Exit with a message if a key is not an argument of the constructor, or a value or wrapper does not work.
 
     :param entry: hyperparameters for one environment
-    :param algo: the algorithm
-    :param source: where the hyperparameters are from, for messages
+    :param source: where they are from, for messages
     """
     algorithm = ALGOS[algo]
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))
@@ -181,7 +156,7 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
 def check_values(entry: dict[str, Any], source: str) -> None:
     """Exit with a message if a value is a number that was read as text, or if RL Zoo cannot use it."""
     for key, value in entry.items():
-        if is_text_of_number(value):
+        if np.isfinite(number_in(value)):  # as YAML reads 1e5
             written = np.format_float_positional(float(value), trim="-")
             fail(
                 f"{source}: {key} must be a number, got the text {value!r}, which YAML does not read as one: write {written}."

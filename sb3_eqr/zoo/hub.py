@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 import huggingface_hub
 import huggingface_sb3
 import requests
+import wasabi
 
 from sb3_eqr.common.saving.files import temporary_folder
 
@@ -16,20 +17,19 @@ DOWNLOAD = huggingface_sb3.load_from_hub
 REPLACED = {
     "pip install rl_zoo3": 'pip install ".[atari,zoo]"  # in a clone of the repository of sb3-eqr',
     "python -m rl_zoo3.": "sb3-eqr ",
+    "\nsb3-eqr load_from_hub": "\nTRUST_REMOTE_CODE=True sb3-eqr load_from_hub",  # it unpickles the model
 }
 
 
-def correct_card(text: str) -> str:
-    """
-    :param text: a model card by RL Zoo
-    :return: the card with commands that know our agents
-    """
+def correct_card(folder: str | pathlib.Path) -> None:
+    """In the model card that RL Zoo has written into a folder, use commands that know our agents."""
+    card = pathlib.Path(folder) / "README.md"
+    text = card.read_text(encoding="utf-8")
     for old, new in REPLACED.items():
         text = text.replace(old, new)
-    text = text.replace("\nsb3-eqr load_from_hub", "\nTRUST_REMOTE_CODE=True sb3-eqr load_from_hub")  # it unpickles the model
     second = text.find("If you installed the RL Zoo3 via pip")  # repeats the commands
     end = text.find("## Training", second)
-    return text if second < 0 else text[:second] + text[end:]
+    card.write_text(text if second < 0 else text[:second] + text[end:], encoding="utf-8")
 
 
 class CheckedHub(huggingface_hub.HfApi):
@@ -37,33 +37,27 @@ class CheckedHub(huggingface_hub.HfApi):
 
     def upload_folder(self, *, folder_path: str | pathlib.Path, **kwargs: Any) -> Any:  # type: ignore[override]
         """Correct the card, then upload as ``HfApi`` does."""
-        card = pathlib.Path(folder_path) / "README.md"
-        card.write_text(correct_card(card.read_text(encoding="utf-8")), encoding="utf-8")
-        return self._send(folder_path, kwargs)
-
-    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> Any:
+        correct_card(folder_path)
         return super().upload_folder(folder_path=folder_path, **kwargs)
 
 
-class DryHub(CheckedHub):
+class DryHub(huggingface_hub.HfApi):
     """Builds everything in the folder and uploads nothing."""
 
     def create_repo(self, repo_id: str, **kwargs: Any) -> str:  # type: ignore[override]
-        """
-        :return: a placeholder for the address
-        """
+        """:return: a placeholder for the address"""
         return f"{repo_id} (not uploaded)"
 
     def snapshot_download(self, repo_id: str, *, local_dir: str | pathlib.Path, **kwargs: Any) -> str:  # type: ignore[override]
-        """
-        :return: the folder, which is created
-        """
+        """:return: the folder, which is created"""
         pathlib.Path(local_dir).mkdir(parents=True, exist_ok=True)
         return str(local_dir)
 
-    def _send(self, folder_path: str | pathlib.Path, kwargs: dict[str, Any]) -> NoReturn:
+    def upload_folder(self, *, folder_path: str | pathlib.Path, **kwargs: Any) -> NoReturn:  # type: ignore[override]
+        """Correct the card, and exit before RL Zoo reports a successful upload."""
+        correct_card(folder_path)
         print(f"--dry-run: built in {folder_path}, nothing was uploaded.")
-        raise SystemExit(0)  # before RL Zoo reports a successful upload
+        raise SystemExit(0)
 
 
 def generate_metadata(*args: Any) -> dict[str, Any]:
@@ -77,11 +71,8 @@ def generate_metadata(*args: Any) -> dict[str, Any]:
 
 def load_from_hub(repo_id: str, filename: str) -> str:
     """
-    :param repo_id: id of the repository
-    :param filename: name of the file in it
-    :return: path of the downloaded file
-    :raises requests.HTTPError: if there is no such file; RL Zoo 2.9 expects it for models without normalisation, but current
-        versions of huggingface_hub raise another error (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252)
+    As huggingface_sb3's, but raises ``requests.HTTPError`` if there is no such file. RL Zoo 2.9 expects it for models without
+    normalisation; current versions of huggingface_hub raise another (https://github.com/DLR-RM/rl-baselines3-zoo/issues/252).
     """
     try:
         return DOWNLOAD(repo_id, filename)
@@ -90,12 +81,10 @@ def load_from_hub(repo_id: str, filename: str) -> str:
 
 
 def prepare(dry_run: bool) -> None:
-    """
-    Patch what RL Zoo's ``push_to_hub`` and ``load_from_hub`` use.
-
-    :param dry_run: whether to only build the folder
-    """
+    """Patch what RL Zoo's ``push_to_hub``, which only builds the folder if ``dry_run``, and ``load_from_hub`` use."""
     huggingface_hub.HfApi = DryHub if dry_run else CheckedHub  # type: ignore[misc]
+    if dry_run:
+        wasabi.Printer.info = lambda *_: None  # type: ignore[method-assign] # RL Zoo says that it pushes
     importlib.import_module("huggingface_sb3.push_to_hub").generate_metadata = generate_metadata  # type: ignore[attr-defined]
     huggingface_sb3.load_from_hub = load_from_hub
     provide_ffmpeg()

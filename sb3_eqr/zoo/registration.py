@@ -1,4 +1,4 @@
-"""Register the agents with RL Zoo."""
+"""Register the agents with RL Zoo, and the search space of ``-optimize``."""
 
 from functools import partial
 from typing import Any
@@ -7,7 +7,65 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
 from sb3_eqr import AGENTS, envs
-from sb3_eqr.zoo.search import convert_eqr_params, make_sampler
+
+NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
+
+
+def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled: values by the names of :func:`sample_eqr_params`
+    :param kept: ``policy_kwargs`` that are not searched, which RL Zoo would drop
+    :return: keyword arguments of the agent
+    """
+    params = dict(sampled)
+    batch_size, train_freq = 2 ** params.pop("batch_size_pow"), 2 ** params.pop("train_freq_pow")
+    policy_kwargs = {**kept, **{name: params.pop(name) for name in ("group", "n_blocks", "net_arch", "noisy")}}
+    policy_kwargs["net_arch"] = NET_ARCHS[policy_kwargs["net_arch"]]
+    if "return_range" in params:
+        policy_kwargs["v_max"] = float(params.pop("return_range"))
+        policy_kwargs["v_min"] = -policy_kwargs["v_max"]
+    return {
+        "gamma": 1 - params.pop("one_minus_gamma"),
+        "batch_size": batch_size,
+        "train_freq": train_freq,
+        "gradient_steps": max(round(train_freq * params.pop("replay_ratio")), 1),
+        **params,
+        "policy_kwargs": policy_kwargs,
+    }
+
+
+def sample_eqr_params(
+    trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any], *, categorical: bool, kept: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sample as RL Zoo does: group, blocks, depth, the three coefficients, learning rate, n-step, replay ratio.
+
+    :param categorical: whether to search the range of returns as well
+    :param kept: ``policy_kwargs`` that are not searched
+    :return: keyword arguments of the agent
+    """
+    sampled = {
+        "learning_rate": trial.suggest_float("learning_rate", 2e-4, 3e-3, log=True),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.03, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 6),
+        "train_freq_pow": trial.suggest_int("train_freq_pow", 0, 8),
+        "replay_ratio": trial.suggest_categorical("replay_ratio", [0.25, 0.5, 1.0]),
+        "n_steps": trial.suggest_int("n_steps", 1, 8),
+        "prediction_depth": trial.suggest_int("prediction_depth", 1, 5),
+        "aet_coef": trial.suggest_categorical("aet_coef", [0.0, 0.1, 0.3, 1.0]),
+        "symmetry_coef": trial.suggest_categorical("symmetry_coef", [0.0, 0.1, 0.3, 1.0]),
+        "reward_coef": trial.suggest_categorical("reward_coef", [0.0, 0.1, 0.3, 1.0]),
+        "target_update_interval": trial.suggest_int("target_update_interval", 100, 2_000, log=True),
+        "exploration_fraction": trial.suggest_float("exploration_fraction", 0.05, 0.3),
+        "exploration_final_eps": trial.suggest_float("exploration_final_eps", 0.01, 0.1),
+        "group": trial.suggest_categorical("group", ["SE(2)", "SO(3)", "GL(2)", "T(2)"]),
+        "n_blocks": trial.suggest_int("n_blocks", 2, 16),
+        "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
+        "noisy": trial.suggest_categorical("noisy", [False, True]),
+    }
+    if categorical:
+        sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 200, 400])
+    return convert_eqr_params(sampled, kept)
 
 
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:
@@ -19,7 +77,8 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     ALGOS.update(AGENTS)  # type: ignore[arg-type]
     kept = policy_kwargs or {}
     for name in AGENTS:
-        HYPERPARAMS_SAMPLER[name] = make_sampler(name == "eqr_rainbow", kept)
+        sampler = partial(sample_eqr_params, categorical=name == "eqr_rainbow", kept=kept)
+        HYPERPARAMS_SAMPLER[name] = sampler  # type: ignore[assignment]
         HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
     envs.register()
 
@@ -27,11 +86,5 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
 def trust_files(algo: str) -> None:
     """Make RL Zoo, which cannot pass ``trust``, load the files of an agent with it: its own classes are then imported."""
     kind = AGENTS[algo]
-
-    class Trusting(kind):  # type: ignore[valid-type, misc]
-        @classmethod
-        def load(cls, *args: Any, **kwargs: Any) -> Any:
-            return super().load(*args, **{**kwargs, "trust": True})
-
-    Trusting.__name__ = kind.__name__  # saved with its files
-    ALGOS[algo] = Trusting
+    load = partial(kind.load, trust=True)
+    ALGOS[algo] = type(kind.__name__, (kind,), {"load": staticmethod(load)})  # files hold the name

@@ -1,19 +1,24 @@
 """Resumable runs of ``sb3-eqr train``: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
 
+import math
 import pathlib
 import shutil
+import signal
 from collections.abc import Sequence
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
-from rl_zoo3 import train
+import yaml
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_eqr import AGENTS
+from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.trust import check_zoo_folder, read_plain
@@ -31,23 +36,56 @@ class RngPreserving(EventCallback):
 
 
 class ResumableExperiment(ExperimentManager):
-    """RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``."""
+    """
+    RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``.
 
-    checkpoint_every: ClassVar[int | None] = None
-    resume: ClassVar[pathlib.Path | None] = None
-    trust: ClassVar[bool] = False
+    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
+    :param resume: a run's folder, or a folder of checkpoints; ``None``: a new run
+    :param trust: as in ``load``
+    """
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    def __init__(self, *args: Any, checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.continue_training = self.continue_training or self.resume is not None
+        self.checkpoint_every, self.resume, self.trust = checkpoint_every, resume, trust
+        self.best: tuple[float, dict[str, Any]] = (-math.inf, {})  # value and parameters of a search's best trial
+        self.continue_training = self.continue_training or resume is not None
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """As RL Zoo's; exits with a message instead of a traceback if the experiment cannot be built."""
+        """
+        As RL Zoo's; exits with a message instead of a traceback if the experiment cannot be built. A signal to end counts as
+        Ctrl-C, after which RL Zoo saves the agent.
+        """
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
-            return super().setup_experiment()
+            found = super().setup_experiment()
         except (ValueError, TypeError, IndexError, ImportError) as error:
-            shutil.rmtree(self.save_path, ignore_errors=True)  # made for this run; enjoy would look for its model there
+            self._remove_folder()
             fail(f"{self.algo} on {self.env_name.gym_id}, by {self.config}: {error}")
+        except BaseException:
+            self._remove_folder()
+            raise
+        if found is not None and isinstance(found[0], EqRAlgorithm):
+            print(f"{in_one_line(found[0])}, by {self.config}. Without it, {type(found[0]).__name__} has other defaults.")
+        return found
+
+    def _remove_folder(self) -> None:
+        """Remove the folder made for this run, where enjoy would look for a model."""
+        shutil.rmtree(self.save_path, ignore_errors=True)
+
+    def objective(self, trial: Any) -> float:
+        """As RL Zoo's; keeps the best trial."""
+        value = super().objective(trial)
+        self.best = max(self.best, (value, trial.params), key=lambda found: found[0])
+        return value
+
+    def hyperparameters_optimization(self) -> None:
+        """As RL Zoo's, which prints the numbers that it drew; adds the arguments that they stand for."""
+        try:
+            super().hyperparameters_optimization()
+        finally:
+            self._remove_folder()
+        if self.algo in AGENTS and self.best[1]:
+            print(f"As hyperparameters in a YAML file:\n{yaml.safe_dump(HYPERPARAMS_CONVERTER[self.algo](self.best[1]))}")
 
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""
@@ -80,6 +118,13 @@ class ResumableExperiment(ExperimentManager):
             super().learn(SimpleNamespace(learn=counting_on, env=model.env))  # type: ignore[arg-type]
 
 
+def in_one_line(model: EqRAlgorithm) -> str:
+    """The agent's class, group and losses."""
+    weights = {"AET": model.aet_coef, "GET": model.symmetry_coef, "reward": model.reward_coef} if model.depth else {}
+    losses = ", ".join(f"{name} {weight:g}" for name, weight in weights.items() if weight)
+    return f"{type(model).__name__}: {model.policy.description['group']}; auxiliary losses: {losses or 'none'}"
+
+
 def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
     """The folder of checkpoints in a run's folder; any other path is returned unchanged."""
     return path / FOLDER if (path / FOLDER).is_dir() else path
@@ -87,7 +132,7 @@ def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
 
 def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> dict[str, Any] | None:
     """
-    :param path: as ``resume`` in :func:`install`, or one checkpoint
+    :param path: a run's folder, a folder of checkpoints, or one checkpoint
     :param trust: whether the settings may name code of any package
     :param packages: packages whose code they may name in any case
     :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
@@ -102,17 +147,3 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
             entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
             return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
     return None
-
-
-def install(checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool) -> None:
-    """
-    Make ``rl_zoo3.train`` use this experiment. Options are class attributes, because its parser knows only its own arguments.
-
-    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
-    :param resume: a run's folder, or a folder of checkpoints
-    :param trust: as in ``load``
-    """
-    ResumableExperiment.checkpoint_every = checkpoint_every
-    ResumableExperiment.resume = resume
-    ResumableExperiment.trust = trust
-    train.ExperimentManager = ResumableExperiment  # type: ignore[misc]

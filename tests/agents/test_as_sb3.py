@@ -11,12 +11,13 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import NatureCNN
 from torch.nn import functional as F
 
 from sb3_eqr import EqRRainbow, GroupFeaturesExtractor
-from tests.models import EITHER, MAKERS
-from tests.toys import ChainEnv, DictEnv, ImageEnv
+from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor
+from tests.models import EITHER, MAKERS, same, tensors
+from tests.toys import ChainEnv, DictEnv, ImageEnv, SampledEnv
 
 
 def continued(model):
@@ -25,7 +26,7 @@ def continued(model):
     model.replay_buffer._tree.set(th.arange(40).numpy(), 1.0)
     model.set_random_seed(0)
     model.train(3, 8)
-    return list(model.policy.parameters())
+    return model
 
 
 @pytest.mark.parametrize(
@@ -35,12 +36,10 @@ def test_a_model_can_be_copied_while_it_trains(make, copied, tmp_path):
     model = make(ChainEnv(), policy_kwargs={"projection": "own", "aet_loss": "contrastive"}).learn(46)
     model.set_logger(configure(str(tmp_path), ["stdout", "tensorboard", "csv"]))  # open files
     copy = copied(model)
-    before = [p.clone() for p in copy.policy.parameters()]
+    before = tensors(copy)
     ours = continued(model)
-    assert all(th.equal(a, b) for a, b in zip(before, copy.policy.parameters(), strict=True))  # no tensor is shared
-    theirs = continued(copy)
-    assert all(th.equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    assert any(not th.equal(a, b) for a, b in zip(before, theirs, strict=True))
+    assert same(before, copy)  # no tensor is shared
+    assert same(ours, continued(copy)) and not same(before, copy)
     n_updates = copy._n_updates
     assert copy.learn(2, reset_num_timesteps=False)._n_updates == n_updates + 4 and copy.logger is not model.logger
 
@@ -65,30 +64,30 @@ def test_state_dicts_are_floats_and_counters(make, policy, env):
     [
         (
             {"prediction_dpeth": 3},
-            r"^EqR(QRDQN|Rainbow) got an unexpected argument 'prediction_dpeth'. Did you mean 'prediction_depth'\?",
+            r"^EqR(QRDQN|Rainbow) got .* argument 'prediction_dpeth'. Did you mean 'prediction_depth'\?",
         ),
         ({"get_coef": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'get_coef'. Did you mean 'symmetry_coef'\?"),
         ({"reward_loss": "mse"}, r"got an unexpected argument 'reward_loss'. Pass policy_kwargs=dict\(reward_loss=...\)"),
+        ({"layer_norm": 1}, r"got an unexpected argument 'layer_norm'. Pass policy_kwargs=dict\(layer_norm=...\)"),
         ({"alpha": 0.6}, r"got an unexpected argument 'alpha'. Pass replay_buffer_kwargs=dict\(alpha=...\)"),
         ({"bogus": 3}, r"^EqR(QRDQN|Rainbow) got an unexpected argument 'bogus'. It takes policy, env, learning_rate,.*seed"),
-        (
-            {"policy_kwargs": {"aet_coef": 3}},
-            r"^policy_kwargs: 'aet_coef' is an argument of the agent. Pass aet_coef=... beside policy_kwargs\.$",
-        ),
-        (
-            {"policy_kwargs": {"n_block": 3}},
-            r"^policy_kwargs: EqR.*Policy got an unexpected .*'n_block'. Did you mean 'n_blocks'\?",
-        ),
-        (
-            {"replay_buffer_kwargs": {"alhpa": 3}},
-            r"^replay_buffer_kwargs: PrioritizedSequenceReplayBuffer got .* 'alhpa'. Did you mean 'alpha'\?",
-        ),
+        ({"policy_kwargs": {"aet_coef": 3}}, r"^policy_kwargs: 'aet_coef' is an argument .* Pass aet_coef=... beside .*\.$"),
+        ({"policy_kwargs": {"n_block": 3}}, r"^policy_kwargs: EqR.*Policy got .*'n_block'. Did you mean 'n_blocks'\?"),
+        ({"replay_buffer_kwargs": {"alhpa": 3}}, r"^replay_buffer_kwargs: Prioritized.* 'alhpa'. Did you mean 'alpha'\?"),
         ({"prioritized_replay": False, "replay_buffer_kwargs": {"alpha": 0.7}}, "SequenceReplayBuffer got .* 'alpha'"),
     ],
 )
 def test_misspelt_arguments(make, kwargs, message):
     with pytest.raises(TypeError, match=message):
         make(ChainEnv(), **kwargs)
+
+
+def test_arguments_of_the_other_agent_and_of_its_policy(make):
+    own, other = make.n_atoms_name, next(maker.n_atoms_name for maker in MAKERS if maker is not make)
+    with pytest.raises(TypeError, match=f"policy_kwargs: EqR.*Policy got an unexpected argument {other!r}"):
+        make(ChainEnv(), policy_kwargs={other: 5})
+    with pytest.raises(TypeError, match=rf"unexpected argument '{own}'. Pass policy_kwargs=dict\({own}=...\)"):
+        make(ChainEnv(), **{own: 5})
 
 
 def test_the_signature_shows_the_constructors_arguments(make):
@@ -103,11 +102,11 @@ def trunk_of(model):
 
 
 @EITHER
-@pytest.mark.parametrize("name", ["nature", "impala"])
-def test_our_extractors_accept_features_dim(make, name):
+@pytest.mark.parametrize("name, kind", [("nature", ConvExtractor), ("impala", ImpalaExtractor)])
+def test_our_extractors_accept_features_dim(make, name, kind):
     network = {"features_extractor_class": name, "features_extractor_kwargs": {"features_dim": 24}}
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(50)
-    assert model.policy.group_layer.to_algebra.in_features == 24
+    assert model.policy.group_layer.to_algebra.in_features == 24 and isinstance(trunk_of(model), kind)
     features = trunk_of(model)(th.rand(2, 1, 36, 36))
     assert features.shape == (2, 24) and (features >= 0).all()  # a ReLU, as in SB3's NatureCNN
     assert trunk_of(make(ImageEnv(), "CnnPolicy")).linear is None
@@ -144,52 +143,10 @@ def test_dicts_may_hold_small_images(make):
 )
 def test_features_of_a_single_number_depend_on_it(make, space):
     """A layer norm of the number itself would give 0."""
-
-    class OneNumber(ChainEnv):
-        def __init__(self):
-            super().__init__()
-            self.observation_space = space
-
-        def observe(self):
-            found = super().observe()[:1]
-            return {"x": found} if isinstance(space, spaces.Dict) else found
-
-    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
-    model = make(OneNumber(), policy)
-    values = th.linspace(-1, 1, 9)[:, None]
-    features = model.policy.online.features_extractor({"x": values} if isinstance(space, spaces.Dict) else values)
+    is_dict, values = isinstance(space, spaces.Dict), th.linspace(-1, 1, 9)[:, None]
+    model = make(SampledEnv(space), "MultiInputPolicy" if is_dict else "MlpPolicy")
+    features = model.policy.online.features_extractor({"x": values} if is_dict else values)
     assert features.var(dim=0).sum() > 0.1
-
-
-class Own(BaseFeaturesExtractor):
-    def __init__(self, observation_space, features_dim=8):
-        super().__init__(observation_space, features_dim)
-        self.layer = th.nn.Sequential(th.nn.Flatten(), th.nn.Linear(3, features_dim))
-
-    def forward(self, observations):
-        return self.layer(observations)
-
-
-def test_a_custom_extractor_gets_features_dim():
-    network = {"features_extractor_class": Own, "features_extractor_kwargs": {"features_dim": 5}}
-    model = MAKERS[0](ChainEnv(), policy_kwargs=network)
-    assert isinstance(trunk_of(model), Own) and trunk_of(model).features_dim == 5
-
-
-def test_old_import_paths():
-    import sb3_eqr
-    from sb3_eqr.common.groups import MatrixLieGroup, make_group
-    from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor as encoder
-    from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
-
-    for name, found in {
-        "PrioritizedSequenceReplayBuffer": PrioritizedSequenceReplayBuffer,
-        "SequenceReplayBuffer": SequenceReplayBuffer,
-        "GroupFeaturesExtractor": encoder,
-        "MatrixLieGroup": MatrixLieGroup,
-        "make_group": make_group,
-    }.items():
-        assert getattr(sb3_eqr, name) is found
 
 
 @EITHER
@@ -197,7 +154,6 @@ def test_any_key_and_any_size_of_image_in_a_dict(make):
     """SB3's extractor fails for these keys, and for images smaller than 36×36."""
     env = DictEnv(("keys", "items", "a.b", "type"))
     env.observation_space.spaces["board"] = spaces.Box(0, 255, (7, 7, 3), np.uint8)
-    env.observe = lambda: {key: space.sample() for key, space in env.observation_space.items()}
     model = make(env, "MultiInputPolicy").learn(50)
     assert model._n_updates > 0 and trunk_of(model).image_keys == ["board"]
 

@@ -7,27 +7,21 @@ import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
+from tests.models import draw
 
 
 def games(env):
     return env.venv.envs
 
 
-@pytest.mark.parametrize("game", ["Pong", "PongNoFrameskip-v4", "ALE/Pong-v5", "pong"])
-def test_all_names_of_a_game(game):
-    assert atari.atari_env_id(game) == "ALE/Pong-v5"
-
-
-def test_names_of_two_words_and_unknown_games():
-    assert atari.atari_env_id("MsPacman") == atari.atari_env_id("ms_pacman") == atari.atari_env_id("Ms Pacman")
-    assert atari.atari_env_id("MsPacman") == "ALE/MsPacman-v5"
+def test_all_names_of_a_game_and_unknown_games():
+    assert {atari.atari_env_id(name) for name in ("Pong", "PongNoFrameskip-v4", "ALE/Pong-v5", "pong")} == {"ALE/Pong-v5"}
+    assert {atari.atari_env_id(name) for name in ("MsPacman", "ms_pacman", "Ms Pacman")} == {"ALE/MsPacman-v5"}
     with pytest.raises(ValueError, match="Did you mean 'Pong'"):
         make_atari100k_env("Pnog")
     for other in ("PongNoFrameskip-v9", "PongDeterministic-v4"):  # a different protocol
@@ -77,21 +71,12 @@ def test_no_fire_no_sticky_actions():
     env = make_atari100k_env("Breakout", seed=0)
     ale = games(env)[0].unwrapped.ale
     assert ale.getFloat("repeat_action_probability") == 0.0
-    wrappers, layer = [], games(env)[0]
-    while layer is not layer.unwrapped:
-        wrappers.append(type(layer).__name__)
-        layer = layer.env
-    assert "FireResetEnv" not in wrappers and "StickyActionEnv" not in wrappers
     env.reset()
-    for _ in range(50):
-        obs, *_ = env.step(np.array([0]))
-    quiet = obs.copy()
-    for _ in range(5):
-        obs, *_ = env.step(np.array([0]))
-    assert np.array_equal(obs, quiet)  # nothing moves until the agent presses FIRE
-    for action in (1, 1, 0, 0, 0):
-        obs, *_ = env.step(np.array([action]))
-    assert not np.array_equal(obs, quiet)
+    quiet, waited, fired = (
+        [env.step(np.array([action]))[0].copy() for action in actions][-1] for actions in ([0] * 50, [0] * 5, [1, 1, 0, 0, 0])
+    )
+    assert np.array_equal(waited, quiet)  # nothing moves until the agent presses FIRE
+    assert not np.array_equal(fired, quiet)
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -120,7 +105,6 @@ def test_games_are_truncated_at_the_step_limit(monkeypatch):
         assert dones[0] == (step % 30 == 0)
         if dones[0]:
             assert infos[0]["TimeLimit.truncated"] and infos[0]["episode"]["l"] == 30
-    assert (atari.MAX_STEPS, atari.FRAME_SKIP) == (30, 4)
 
 
 def test_the_step_limit_follows_the_paper():
@@ -156,29 +140,10 @@ def test_replay_of_real_games_equals_the_plain_buffer():
             buffer.add(obs, next_obs, actions, rewards, dones, infos)
         obs = new_obs
     assert ends > 3
-    np.random.seed(0)
-    a = plain.sample(400)
-    np.random.seed(0)
-    b = ours.sample(400)
+    a, b = draw(plain, 400), draw(ours, 400)
     for field in ("observations", "actions", "next_observations", "dones", "rewards"):
         assert th.equal(getattr(a, field), getattr(b, field))
     assert ours.nbytes / 300 < 8_500
-
-
-def test_training_on_atari_saving_and_loading(tmp_path):
-    env = make_atari100k_env("Pong", n_envs=1, seed=0)
-    model = EqRQRDQN("CnnPolicy", env, seed=0, learning_starts=60, buffer_size=200, batch_size=8)
-    model.learn(66)
-    model.dump_logs()
-    assert model._n_updates == 12 and model.frame_stack == 4
-    model.save(tmp_path / "pong")
-    loaded = EqRQRDQN.load(tmp_path / "pong", env=env)
-    obs = env.reset()
-    assert loaded.predict(obs, deterministic=True)[0] == model.predict(obs, deterministic=True)[0]
-    short = make_atari100k_env("Pong", seed=1, training=False)
-    games(short)[0].env.env.env._max_episode_steps = 40
-    mean, _ = evaluate_policy(loaded, short, n_eval_episodes=1)
-    assert -21 <= mean <= 21
 
 
 def test_the_wrapper_for_rl_zoo_gives_the_training_environment():
@@ -200,8 +165,5 @@ def test_the_wrapper_rejects_a_different_protocol():
     with pytest.raises(ValueError, match=r"got .*'repeat_action_probability': 0.25.*NoFrameskip-v4 name"):
         make_vec_env("ALE/Pong-v5", wrapper_class=Atari100kWrapper)
     kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}
-    assert make_vec_env("ALE/Pong-v5", env_kwargs=kwargs, wrapper_class=Atari100kWrapper).observation_space.shape == (
-        84,
-        84,
-        1,
-    )
+    env = make_vec_env("ALE/Pong-v5", env_kwargs=kwargs, wrapper_class=Atari100kWrapper)
+    assert env.observation_space.shape == (84, 84, 1)

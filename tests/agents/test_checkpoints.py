@@ -1,9 +1,9 @@
 """Checkpoints: an interrupted and resumed run equals an uninterrupted one."""
 
+import shutil
 import subprocess
 import sys
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -14,11 +14,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
 import sb3_eqr
-from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, envs
+from sb3_eqr import EqRQRDQN, MatrixLieGroup, envs
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
 from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import ChannelsFirstImage
-from tests.toys import ChainEnv
+from tests.models import same
+from tests.toys import ChainEnv, SampledEnv
 
 envs.register()
 STEPS = 160
@@ -57,16 +58,13 @@ def test_resuming_in_a_new_process_is_bit_identical(algorithm, tmp_path):
     found = sorted(path.name for path in tmp_path.iterdir())
     assert len(found) == 3 and all(name.startswith("checkpoint-0000000001") for name in found[1:])
     for later in found[1:]:  # as if the run had been killed after the first checkpoint
-        for file in (tmp_path / later).iterdir():
-            file.unlink()
-        (tmp_path / later).rmdir()
+        shutil.rmtree(tmp_path / later)
     command = f"from tests.agents.test_checkpoints import resume; resume({algorithm!r}, {str(tmp_path)!r})"
     subprocess.run([sys.executable, "-c", command], check=True)
     resumed = kind.load(tmp_path / "resumed")
     for model in (stopped, resumed):
         assert model.num_timesteps == whole.num_timesteps and model._n_updates == whole._n_updates > 20
-        mine, other = model.policy.state_dict(), whole.policy.state_dict()
-        assert all(th.equal(mine[key], other[key]) for key in other)
+        assert same(model, whole)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -77,18 +75,17 @@ def checkpoint(tmp_path):
     return found
 
 
+DAMAGES = {"flipped": lambda half, rest: half + bytes([rest[0] ^ 1]) + rest[1:], "truncated": lambda half, rest: half}
+
+
 @pytest.mark.parametrize("name", ["model.zip", "replay_buffer.pkl", "manifest.json"])
-@pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+@pytest.mark.parametrize("damage", [*DAMAGES, "gone"])
 def test_a_damaged_checkpoint_raises(checkpoint, name, damage):
     path = checkpoint / name
     content = path.read_bytes()
-    if damage == "gone":
-        path.unlink()
-    else:
-        half = len(content) // 2
-        path.write_bytes(
-            content[:half] if damage == "truncated" else content[:half] + bytes([content[half] ^ 1]) + content[half + 1 :]
-        )
+    path.unlink()
+    if damage in DAMAGES:
+        path.write_bytes(DAMAGES[damage](content[: len(content) // 2], content[len(content) // 2 :]))
     with pytest.raises(ValueError, match=r"must be (unchanged|a complete checkpoint|a checkpoint or a folder)"):
         EqRQRDQN.resume(checkpoint, ChainEnv())
 
@@ -98,54 +95,21 @@ def test_the_last_complete_checkpoint_is_used(checkpoint):
     assert EqRQRDQN.resume(checkpoint.parent, ChainEnv()).num_timesteps == int(checkpoint.name.partition("-")[2])
     with pytest.raises(ValueError, match="got nothing"):
         EqRQRDQN.resume(checkpoint.parent / "none", ChainEnv())
-    with pytest.raises(ValueError, match="policy must be derived from EqRRainbowPolicy"):
-        EqRRainbow.resume(checkpoint, ChainEnv())
-
-
-def test_an_environment_state_that_cannot_be_saved_warns(tmp_path):
-    pytest.importorskip("Box2D")
-    env = VecNormalize(make_vec_env("LunarLander-v3", 1))
-    EqRQRDQN("MlpPolicy", env, **SMALL).learn(60, ExactCheckpointCallback(60, tmp_path))
-    env.obs_rms.mean[:] = 7.0
-    write_checkpoint(tmp_path / "by hand", EqRQRDQN("MlpPolicy", env, **SMALL))
-    with pytest.warns(UserWarning, match=r"the state of .*LunarLander is not known.*new episodes"):
-        model = EqRQRDQN.resume(tmp_path / "by hand", VecNormalize(make_vec_env("LunarLander-v3", 1)))
-    assert (model.get_vec_normalize_env().obs_rms.mean == 7.0).all()  # the statistics are not lost
-    model.learn(10, reset_num_timesteps=False)
-
-
-def ring(length=20):
-    """An environment whose state is in a closure."""
-    place = 0
-
-    class Ring(gym.Env):
-        observation_space, action_space = spaces.Box(-1, 1, (3,), np.float32), spaces.Discrete(3)
-
-        def reset(self, *, seed=None, options=None):
-            nonlocal place
-            super().reset(seed=seed)
-            place, self.begun = 0, float(self.np_random.random())
-            return np.zeros(3, dtype=np.float32), {}
-
-        def step(self, action):
-            nonlocal place
-            place += 1
-            return np.full(3, place / length, dtype=np.float32), 1.0, place == length, False, {}
-
-    return Ring()
 
 
 def test_an_environment_of_an_unknown_class_is_resumed_with_new_episodes(tmp_path):
-    EqRQRDQN("MlpPolicy", ring(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
-    with pytest.warns(UserWarning, match=r"the state of .*Ring is not known.*state_dict and load_state_dict") as caught:
-        model = EqRQRDQN.resume(tmp_path, ring())
+    def make_env():
+        return VecNormalize(make_vec_env(lambda: SampledEnv(spaces.Box(-1, 1, (3,), np.float32))))
+
+    EqRQRDQN("MlpPolicy", make_env(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
+    with pytest.warns(UserWarning, match=r"the state of .*SampledEnv is not known.*state_dict and load_state_dict") as caught:
+        model = EqRQRDQN.resume(tmp_path, make_env())
     assert sum("is not known" in str(warning.message) for warning in caught) == 1
-    assert model._last_obs is None
+    assert model._last_obs is None and model.get_vec_normalize_env().obs_rms.count > 45  # the statistics are not lost
     model.learn(20, reset_num_timesteps=False)
-    begun = model.env.envs[0].unwrapped.begun
-    first = ring()
-    first.reset(seed=SMALL["seed"])
-    assert first.begun != begun  # the run's first episode is not played again
+    rows = np.arange(model.replay_buffer.pos)
+    stored = model.replay_buffer._stores[""].observations(rows, 0 * rows, following=False)
+    assert len(rows) > 60 and (stored == stored[0]).all(axis=1).sum() == 1  # the run's first episode is not played again
 
 
 def test_a_checkpoint_that_was_removed_in_part_is_removed(tmp_path, monkeypatch):
@@ -167,12 +131,6 @@ def test_checkpoints_are_counted_from_the_first_step_of_the_run(tmp_path):
     assert [path.name for path in find_checkpoints(tmp_path)] == ["checkpoint-000000000120"]
 
 
-@pytest.mark.parametrize("wrong", [{"save_freq": 0}, {"save_freq": 1.5}, {"keep": 0}])
-def test_callback_arguments(wrong, tmp_path):
-    with pytest.raises(ValueError, match=r"must be an integer >= 1, got"):
-        ExactCheckpointCallback(**{"save_freq": 10, "save_path": tmp_path, **wrong})
-
-
 def test_different_runs_cannot_share_a_folder(checkpoint):
     folder = checkpoint.parent
     before = sorted(folder.iterdir())
@@ -183,22 +141,14 @@ def test_different_runs_cannot_share_a_folder(checkpoint):
         ({"policy_kwargs": group}, r"policy_kwargs = \{.*'latent_hidden_dim': 8,.*'group': 'SO\(3\)'"),
         ({"resets": {"interval": 5}}, r"resets = "),
         ({"learning_rate": lambda progress: 1e-3}, r"learning_rate = 0.0001 there, .*lambda"),
+        ({"env": type("OtherEnv", (ChainEnv,), {})()}, r"environment = \{'id': 'ChainEnv'\} there, \{'id': 'OtherEnv'\} here"),
     ):
-        other = EqRQRDQN("MlpPolicy", ChainEnv(), **{**SMALL, **changes})
+        other = EqRQRDQN("MlpPolicy", **{"env": ChainEnv(), **SMALL, **changes})
         with pytest.raises(ValueError, match=rf"must be empty or hold checkpoints of this run, .*{why}.*Pass another folder"):
             other.learn(60, ExactCheckpointCallback(20, folder))
     with pytest.raises(ValueError, match=r"observation_space = 'Box.*\(3,\), float32\)' there"):
         EqRQRDQN("MlpPolicy", "Acrobot-v1", **SMALL).learn(60, ExactCheckpointCallback(20, folder))
     assert sorted(folder.iterdir()) == before
-
-
-class OtherEnv(ChainEnv):
-    """With the same spaces."""
-
-
-def test_runs_in_different_environments_cannot_share_a_folder(checkpoint):
-    with pytest.raises(ValueError, match=r"environment = \{'id': 'ChainEnv'\} there, \{'id': 'OtherEnv'\} here"):
-        EqRQRDQN("MlpPolicy", OtherEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, checkpoint.parent))
 
 
 def test_a_checkpoint_is_never_discarded_when_it_is_written(checkpoint):
@@ -232,9 +182,7 @@ def test_the_environment_must_be_built_in_the_same_way(checkpoint):
 
 def test_an_environment_of_another_id_is_refused_and_other_arguments_are_named(tmp_path):
     EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(60, ExactCheckpointCallback(50, tmp_path))
-    with pytest.raises(
-        ValueError, match=r"must be the environment of the original run.*id = 'CartPole-v1' there, 'CartPole-v0' here"
-    ):
+    with pytest.raises(ValueError, match=r"the environment of the original run.*'CartPole-v1' there, 'CartPole-v0' here"):
         EqRQRDQN.resume(tmp_path, make_vec_env("CartPole-v0"))
     shorter = make_vec_env("CartPole-v1", env_kwargs={"max_episode_steps": 50, "sutton_barto_reward": True})
     with pytest.warns(UserWarning, match=r"max_episode_steps = 500 there, 50 here, kwargs = .* there, .*sutton_barto"):
@@ -274,8 +222,7 @@ def test_environments_in_other_processes_are_resumed_exactly(tmp_path):
     assert 60 <= resumed.num_timesteps < 120
     resumed.learn(120 - resumed.num_timesteps, reset_num_timesteps=False)
     env.close()
-    mine, other = resumed.policy.state_dict(), whole.policy.state_dict()
-    assert resumed._n_updates == whole._n_updates > 20 and all(th.equal(mine[key], other[key]) for key in other)
+    assert resumed._n_updates == whole._n_updates > 20 and same(resumed, whole)
     bare = make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv)
     with pytest.raises(ValueError, match=r"env must be Monitor in .*got SubprocVecEnv: the environment is not built as in"):
         EqRQRDQN.resume(tmp_path, bare)

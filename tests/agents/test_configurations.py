@@ -10,11 +10,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr import EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
-from sb3_eqr.common.networks.encoders import ImpalaTrunk
+from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
+from sb3_eqr.common.networks.encoders import ImpalaTrunk, NormalizedExtractor
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
 from sb3_eqr.configurations import configuration_files, with_schedule
+from tests.models import all_finite
 from tests.toys import ImageEnv
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -22,24 +23,18 @@ SMALL = {"learning_starts": 140, "buffer_size": 400, "batch_size": 8, "device": 
 
 # name: encoder, auxiliary losses
 EXPECTED = {
-    "eqr_rainbow": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "paper": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "released": ("SE(2)^12", {"aet", "symmetry", "reward"}),
     "mlp+aet+r": ("none(512)^1", {"aet", "reward"}),
     "t2+aet+r": ("T(2)^32", {"aet", "reward"}),
     "se2+aet+r": ("SE(2)^12", {"aet", "reward"}),
     "gl2+aet+r": ("GL(2)^12", {"aet", "reward"}),
     "se2+aet": ("SE(2)^12", {"aet"}),
     "se2+aet+get": ("SE(2)^12", {"aet", "symmetry"}),
-    "se2+aet+r+get": ("SE(2)^12", {"aet", "symmetry", "reward"}),
-    "rainbow": (None, set()),
-    "qrdqn": (None, set()),
-    "der": (None, set()),
-    "drq": (None, set()),
     "spr": (None, {"aet"}),
     "deepmdp": ("none(512)^1", {"aet", "reward"}),
-    "eqr_bbf": ("SE(2)^12", {"aet", "symmetry", "reward"}),
 }
+FULL = ("eqr_rainbow", "paper", "released", "se2+aet+r+get", "eqr_bbf")
+EXPECTED |= dict.fromkeys(FULL, ("SE(2)^12", {"aet", "symmetry", "reward"}))
+EXPECTED |= dict.fromkeys(("rainbow", "qrdqn", "der", "drq"), (None, set()))
 
 
 def rows(text):
@@ -60,24 +55,42 @@ def test_the_tables_and_the_files_agree():
     assert load_configuration("se2+aet+r+get") == load_configuration("paper")
 
 
-def test_the_papers_agent_matches_table_5():
-    """The numbers of Table 5 and appendix B.4, checked one by one on the built agent."""
+@pytest.mark.parametrize("kind, name", [(EqRQRDQN, None), (EqRRainbow, None), (EqRRainbow, "paper")])
+def test_table_5(kind, name):
+    """Its numbers and those of appendix B.4, on the built agent; the defaults differ as docs/gradients.md says."""
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((84, 84, 1))), 4)
-    model = EqRRainbow("CnnPolicy", env, **load_configuration("paper"), device="cpu")
-    assert (model.batch_size, model.learning_starts, model.gamma, model.n_steps) == (32, 2_000, 0.99, 10)
-    assert (model.train_freq.frequency, model.gradient_steps, model.max_grad_norm) == (1, 2, 10.0)
-    assert (model.learning_rate, model.policy.optimizer.param_groups[0]["eps"]) == (1e-4, 1.5e-4)
-    assert (model.shift_pixels, model.intensity_scale, model.prediction_depth) == (4, 0.05, 5)
-    assert (model.aet_coef / 5, model.symmetry_coef, model.reward_coef / 5) == (1, 1, 1)  # the paper has sums over five steps
-    assert (model.replay_buffer.alpha, model.replay_buffer.beta) == (0.5, 0.4)
-    policy = model.policy
-    assert (policy.sigma_init, policy.latent_model.n_blocks, policy.online.head.n_atoms) == (0.5, 12, 51)
-    assert policy.latent_model.projection is policy.online.head.first and policy.latent_encoder is None
-    assert [layer.kernel_size[0] for layer in policy.online.features_extractor.trunk.trunk if hasattr(layer, "stride")] == [
-        8,
-        4,
-        3,
-    ]
+    model = kind("CnnPolicy", env, **(load_configuration(name) if name else {}), device="cpu")
+    assert (model.batch_size, model.gamma, model.learning_rate, model.max_grad_norm) == (32, 0.99, 1e-4, 10)
+    assert (model.gradient_steps, model.n_steps, model.prediction_depth, model.tau) == (2, 10, 5, 1.0)
+    assert (model.train_freq.frequency, model.train_freq.unit.value, model.frame_stack) == (1, "step", 4)
+    buffer = model.replay_buffer
+    assert (buffer.alpha, buffer.beta, buffer.final_beta) == (0.5, 0.4, 1.0)
+    assert (model.shift_pixels, model.intensity_scale) == (4, 0.05)
+    assert (model.exploration_fraction * 100_000, model.exploration_final_eps) == (2_000, 0)
+    adam = model.policy.optimizer.defaults
+    assert (adam["betas"], adam["eps"]) == ((0.9, 0.999), 1.5e-4)
+    policy, latent, layer = model.policy, model.policy.latent_model, model.policy.group_layer
+    coefs = (model.aet_coef, model.symmetry_coef, model.reward_coef)
+    if name == "paper":
+        assert coefs == (5, 1, 5) and model.learning_starts == 2_000  # the paper has sums over five steps
+        assert latent.projection is policy.online.head.first and policy.latent_encoder is None
+        n_features, sigma_init = 72, 0.5
+    else:
+        assert coefs == (1, 1, 5) and model.aux_gradient_share == 1.0 and model.learning_starts is None
+        assert (policy.layer_norm, policy.head_input) == (True, "trunk")
+        assert (policy.options.projection, policy.options.latent_tau) == ("own", 1.0)
+        assert isinstance(policy.online.features_extractor, NormalizedExtractor)
+        assert latent.projection.weight.shape == (256, 72) and latent.predictor.weight.shape == (256, 256)
+        n_features, sigma_init = 3136, 0.1
+    head = policy.online.head
+    assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], sigma_init) and head.value is not None
+    # σ₀ divided by the square root of the number of inputs
+    assert head.first[0].weight_sigma[0, 0].item() == pytest.approx(sigma_init / n_features**0.5)
+    assert (str(layer.group), layer.n_blocks, latent.state_dim) == ("SE(2)", 12, 72)
+    assert policy.online.features_extractor.features_dim == n_features and latent.transition[0].out_features == 256
+    assert sum(p.numel() for p in layer.to_algebra.parameters()) == (3136 + 1) * 36
+    convolutions = [part for part in policy.online.features_extractor.trunk.trunk if hasattr(part, "stride")]
+    assert [part.kernel_size[0] for part in convolutions] == [8, 4, 3]
 
 
 def test_the_full_agent_is_the_default():
@@ -85,15 +98,12 @@ def test_the_full_agent_is_the_default():
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
     default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
     default._setup_learn(100_000, None)  # learning_starts follows the length of the run
-    for key, value in load_configuration("eqr_rainbow").items():
-        if key not in ("policy_kwargs", "replay_buffer_kwargs", "train_freq"):
-            assert getattr(default, key) == value, key
-    for key, value in load_configuration("eqr_rainbow")["replay_buffer_kwargs"].items():
-        assert getattr(default.replay_buffer, key) == value, key
-    assert default.train_freq == named.train_freq
-    for key, value in load_configuration("eqr_rainbow")["policy_kwargs"].items():
-        found = {**vars(default.policy), **vars(default.policy.options)}[key]
-        assert (12 if found is None else found) == value  # the default of n_blocks depends on the group
+    assert default.train_freq == named.train_freq and default.policy.latent_model.n_blocks == 12
+    written = load_configuration("eqr_rainbow")
+    written |= written.pop("replay_buffer_kwargs") | written.pop("policy_kwargs")
+    found = {**vars(default.replay_buffer), **vars(default.policy), **vars(default.policy.options), **vars(default)}
+    found |= {"train_freq": written["train_freq"], "n_blocks": 12}
+    assert {key: found[key] for key in written} == written
 
 
 def nonzero_gradients(module):
@@ -108,7 +118,6 @@ def test_each_configuration_trains_as_in_the_table(name):
     network["net_arch"] = [32]
     if name == "eqr_bbf":
         network["features_extractor_kwargs"]["width_scale"] = 0.25
-        assert arguments["resets"]["interval"] == 40_000 and arguments["resets"]["annealing_steps"] == 10_000
         arguments["resets"].update(interval=8, annealing_steps=4)
     kept = {key: value for key, value in arguments.items() if key not in SMALL}
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
@@ -145,7 +154,7 @@ def test_each_configuration_trains_as_in_the_table(name):
     assert all(nonzero_gradients(part) == ("symmetry" in losses) for part in of_symmetry)
     assert all(p.grad is None for p in [*model.policy.target.parameters(), *model.policy.latent_target.parameters()])
     assert all(not th.equal(before[key], p) for key, p in model.policy.online.named_parameters())
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert all_finite(model)
 
 
 def test_eqr_bbf_follows_the_papers_recipe():
@@ -192,9 +201,7 @@ def test_changes_are_merged():
 
 
 def test_an_entry_with_normalised_observations_warns():
-    with pytest.warns(
-        UserWarning, match=r"'eqr_rainbow', 'MountainCar-v0': its agent is trained with normalize: .*VecNormalize"
-    ):
+    with pytest.warns(UserWarning, match=r"'MountainCar-v0': its agent is trained with normalize: .*VecNormalize"):
         assert "normalize" not in load_configuration("eqr_rainbow", "MountainCar-v0")
     with warnings.catch_warnings():
         warnings.simplefilter("error")

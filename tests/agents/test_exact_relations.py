@@ -8,52 +8,24 @@ from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor
 from sb3_eqr.common.networks.encoders import ConvExtractor, ConvTrunk
-from tests.models import BOTH, PAPER, PAPER_FLAT
+from tests.models import BOTH, PAPER, PAPER_FLAT, same
 from tests.toys import ChainEnv, ImageEnv
 
-OFF = {
-    "aet_coef": 0.0,
-    "symmetry_coef": 0.0,
-    "reward_coef": 0.0,
-    "aux_gradient_share": None,
-    "double_q": False,
-    "prioritized_replay": False,
-    "shift_pixels": 0,
-    "intensity_scale": 0.0,
-}
-SHARED = {
-    "learning_rate": 1e-3,
-    "buffer_size": 300,
-    "learning_starts": 40,
-    "batch_size": 32,
-    "gamma": 0.98,
-    "train_freq": 4,
-    "gradient_steps": 2,
-    "target_update_interval": 50,
-    "exploration_fraction": 0.5,
-    "exploration_final_eps": 0.1,
-    "n_steps": 1,
-    "max_grad_norm": None,
-    "seed": 3,
-    "device": "cpu",
-}
+OFF = {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0, "aux_gradient_share": None}
+OFF |= {"double_q": False, "prioritized_replay": False, "shift_pixels": 0, "intensity_scale": 0.0}
+SHARED = {"learning_rate": 1e-3, "buffer_size": 300, "learning_starts": 40, "batch_size": 32, "gamma": 0.98, "train_freq": 4}
+SHARED |= {"gradient_steps": 2, "target_update_interval": 50, "exploration_fraction": 0.5, "exploration_final_eps": 0.1}
+SHARED |= {"n_steps": 1, "max_grad_norm": None, "seed": 3, "device": "cpu"}
 # The optimiser has the same kernel, because Adam's three kernels round differently.
-NETWORK = {
-    "n_quantiles": 20,
-    "net_arch": [32],
-    "optimizer_class": th.optim.Adam,
-    "optimizer_kwargs": {"eps": 1e-4, "fused": True},
-}
+NETWORK = {"n_quantiles": 20, "net_arch": [32], "optimizer_class": th.optim.Adam}
+NETWORK |= {"optimizer_kwargs": {"eps": 1e-4, "fused": True}}
 
 
 def assert_same_networks(ours, theirs):
     assert ours._n_updates == theirs._n_updates > 0
     for name in ("quantile_net", "quantile_net_target"):
-        ours_all = list(getattr(ours, name).parameters())
-        theirs_all = list(getattr(theirs, name).parameters())
-        assert len(ours_all) == len(theirs_all) > 0
-        for a, b in zip(ours_all, theirs_all, strict=True):
-            assert th.equal(a, b)
+        mine, other = (list(getattr(model, name).parameters()) for model in (ours, theirs))
+        assert mine and same(mine, other)
 
 
 @pytest.mark.parametrize("n_envs, n_steps, max_grad_norm, tau", [(1, 1, None, 1.0), (1, 3, 10.0, 1.0), (3, 5, 0.5, 0.3)])
@@ -68,7 +40,7 @@ def test_with_every_switch_off_it_equals_qrdqn(n_envs, n_steps, max_grad_norm, t
 
 @pytest.mark.parametrize("extractor", [NatureCNN, ConvExtractor])
 def test_with_every_switch_off_it_equals_qrdqn_on_images(extractor):
-    shared = {**SHARED, "learning_starts": 40, "train_freq": 8, "gradient_steps": 1}
+    shared = {**SHARED, "train_freq": 8, "gradient_steps": 1}
     trunk = {"features_extractor_class": extractor}
     theirs = QRDQN("CnnPolicy", ImageEnv(), policy_kwargs={**NETWORK, **trunk}, **shared)
     for module in theirs.policy.modules():
@@ -96,19 +68,13 @@ def test_each_switch_has_an_effect(switched_off):
     settings = {**SHARED, "n_steps": 3, "prediction_depth": 2, "target_update_interval": None}
     full = EqRQRDQN("MlpPolicy", ChainEnv(), **settings).learn(70)
     less = EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, switched_off: 0}).learn(70)
-    assert any(not th.equal(a, b) for a, b in zip(full.quantile_net.parameters(), less.quantile_net.parameters(), strict=True))
-
-
-def same_state(a, b):
-    first, second = a.policy.state_dict(), b.policy.state_dict()
-    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
+    assert not same(full.quantile_net, less.quantile_net)
 
 
 def test_same_seed_same_run_and_different_seed_different_run():
     settings = {**SHARED, "n_steps": 3, "target_update_interval": None}
     a, b, c = (EqRQRDQN("MlpPolicy", ChainEnv(), **{**settings, "seed": s}).learn(80) for s in (1, 1, 2))
-    assert same_state(a, b)
-    assert not same_state(a, c)
+    assert same(a, b) and not same(a, c)
 
 
 @BOTH
@@ -123,4 +89,4 @@ def test_sharing_the_target_pass_changes_no_number(network):
         if not shortcut:
             objective.target_encoder = objective.latent_encoder = model.policy.target.features_extractor
         models.append(model.learn(70))
-    assert same_state(*models)
+    assert same(*models)

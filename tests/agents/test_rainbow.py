@@ -1,13 +1,11 @@
 """Components of EqRRainbow and options from later work, compared with hand-computed numbers or other implementations."""
 
 import math
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRRainbow
@@ -15,7 +13,7 @@ from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, Imp
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
-from tests.models import BOTH, EITHER, MAKERS, PAPER, loss_terms, untrained
+from tests.models import MAKERS, PAPER, all_finite, loss_terms, same, tensors, untrained
 from tests.toys import ChainEnv, ImageEnv
 
 make_rainbow = MAKERS[1]
@@ -83,21 +81,6 @@ def test_dueling_by_hand():
     assert model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0] in (1, 2)
 
 
-def test_q_values_are_expectations_over_the_probabilities():
-    model = make_rainbow(ChainEnv(), policy_kwargs={"v_min": -3.0, "v_max": 5.0}).learn(60)
-    obs = th.randn(7, 3)
-    with th.no_grad():
-        logs = model.q_net.log_probs(obs)
-        q_values = model.q_net(obs)
-    assert logs.shape == (7, 9, 3) and q_values.shape == (7, 3)
-    np.testing.assert_allclose(logs.exp().sum(dim=1), 1, rtol=1e-5)
-    by_hand = sum(logs[:, i].exp() * (-3.0 + i) for i in range(9))
-    th.testing.assert_close(q_values, by_hand, rtol=1e-5, atol=1e-5)
-    actions = model.predict(obs.numpy(), deterministic=True)[0]
-    assert actions.tolist() == by_hand.argmax(dim=1).tolist()
-    assert len(evaluate_policy(model, model.get_env(), n_eval_episodes=2, return_episode_rewards=True)[0]) == 2
-
-
 @pytest.mark.parametrize("dueling", [True, False])
 @pytest.mark.parametrize("v_min, v_max, centre", [(-4.0, 4.0, 0.0), (0.0, 8.0, 0.0), (2.0, 10.0, 2.0)])
 def test_an_untrained_head_predicts_returns_near_0(dueling, v_min, v_max, centre):
@@ -127,24 +110,6 @@ def test_how_much_a_reward_raises_its_priority_at_first(spread, lowest, highest)
     assert lowest < paid / unpaid < highest
 
 
-def test_the_return_distribution_is_learned():
-    """One state, one step: reward 1 with probability 1/4, else -1. A point estimate would be -0.5."""
-
-    class Coin(ChainEnv):
-        def step(self, action):
-            return self.observe(), 1.0 if self.rng.random() < 0.25 else -1.0, True, False, {}
-
-        def observe(self):
-            return np.zeros(3, dtype=np.float32)
-
-    settings = {"learning_starts": 400, "n_steps": 1, "prediction_depth": 0, "prioritized_replay": False, "batch_size": 64}
-    network = {"n_atoms": 5, "v_min": -2.0, "v_max": 2.0}  # atoms -2 ... 2
-    model = make_rainbow(Coin(), learning_rate=1e-2, gradient_steps=1, **settings, policy_kwargs=network).learn(700)
-    wins = float((model.replay_buffer.rewards[: model.replay_buffer.size()] == 1).mean())
-    found = model.q_net.log_probs(th.zeros(1, 3)).exp()[0].mean(dim=1)
-    np.testing.assert_allclose(found.detach(), [0, 1 - wins, 0, wins, 0], atol=0.08)
-
-
 # ---------------------------------------------------------------------------------------------- exploration
 
 
@@ -160,19 +125,6 @@ def test_both_heads_are_noisy_in_an_update(make, is_noisy):
     samples = model.replay_buffer.sample(8)
     first, second = (loss_terms(model, samples).losses["td"] for _ in range(2))
     assert not th.allclose(first, second)
-
-
-def test_noise_explores_in_eval_mode_and_changes_at_every_step():
-    model = make_rainbow(ChainEnv(), learning_starts=0, exploration_initial_eps=0.0).learn(20)
-    model.policy.set_training_mode(False)  # as collect_rollouts does
-    obs = np.zeros((1, 3), dtype=np.float32)
-    assert all(isinstance(stream[0], NoisyLinear) for stream in (model.q_net.head.value, model.q_net.head.advantage))
-    with th.no_grad():
-        noisy = [model.q_net(th.zeros(1, 3), noisy=True) for _ in range(4)]
-        clean = [model.q_net(th.zeros(1, 3)) for _ in range(4)]
-    assert all(not th.equal(noisy[i], noisy[j]) for i in range(4) for j in range(i))
-    assert all(th.equal(clean[0], c) for c in clean)
-    assert len({int(model.predict(obs, deterministic=True)[0][0]) for _ in range(30)}) == 1
 
 
 def test_acting_with_the_target_network():
@@ -203,17 +155,15 @@ def test_the_buffer_uses_the_annealed_n_and_gamma(make, monkeypatch):
     def watched(positions, envs, env):
         samples = windows(positions, envs, env)
         used.append((model._n_updates, buffer.n_steps, buffer.gamma))
-        pairs = zip(positions, samples.rewards[:, 0], samples.discounts[:, 0], strict=True)
-        for position, found, discount in pairs:
+        for position, found, discount in zip(positions, samples.rewards, samples.discounts, strict=True):
             total, power = 0.0, 1.0
             for step in range(buffer.n_steps):
                 total += power * buffer.rewards[position + step, 0]
                 power *= buffer.gamma
                 if buffer.dones[position + step, 0]:
                     break
-            assert found.item() == pytest.approx(total, rel=1e-4, abs=1e-6) and discount.item() == pytest.approx(
-                power, rel=1e-5
-            )
+            assert found.item() == pytest.approx(total, rel=1e-4, abs=1e-6)
+            assert discount.item() == pytest.approx(power, rel=1e-5)
         return samples
 
     monkeypatch.setattr(buffer, "_windows", watched)
@@ -228,29 +178,6 @@ def test_the_buffer_uses_the_annealed_n_and_gamma(make, monkeypatch):
     assert {n for _, n, _ in used} == {8, 7, 6, 5, 4, 3, 2}
 
 
-def test_constant_n_and_gamma_do_not_change(make):
-    model = make(ChainEnv()).learn(60)
-    assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.99)
-
-
-def test_importance_weights_of_bbf(make):
-    """β stays at 1/2, so weights are 1/√P divided by their maximum."""
-    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.5, "final_beta": 0.5}).learn(50)
-    assert model.replay_buffer.beta == 0.5
-    samples = model.replay_buffer.sample(64)
-    found = model.replay_buffer._tree.get(samples.indices)
-    expected = 1 / np.sqrt(found)
-    np.testing.assert_allclose(samples.weights, expected / expected.max(), rtol=1e-5)
-
-
-def test_beta_may_decrease(make):
-    model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.8, "final_beta": 0.2}).learn(50)
-    assert model.replay_buffer.beta == pytest.approx(0.2)
-    model._current_progress_remaining = 0.5
-    model.train(1, 8)
-    assert model.replay_buffer.beta == pytest.approx(0.5)
-
-
 # ---------------------------------------------------------------------------------------------- resets
 
 
@@ -259,17 +186,16 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
     network = PAPER if projection == "head" else {"projection": projection}
     model = make(ChainEnv(), resets={"interval": 20, "shrink_factor": alpha}, tau=0.1, policy_kwargs=network).learn(50)
     assert model._n_updates == 20 and model._resets.done == []  # a reset comes before the next update
-    old = {name: p.clone() for name, p in model.policy.state_dict().items()}
+    old = tensors(model)
     state = th.get_rng_state()
     fresh = make(ChainEnv(), policy_kwargs=network)  # sets the seed, so restore the generator's state for the reset
     th.set_rng_state(state)
     drawn = type(model.policy)(model.observation_space, model.action_space, lambda _: 0.0, **fresh.policy_kwargs).state_dict()
     th.set_rng_state(state)
     model._reset()
-    new = model.policy.state_dict()
     online = "q_net" if make is make_rainbow else "quantile_net"
     kinds = {"fresh": 0, "perturbed": 0, "kept": 0}
-    for name, value in new.items():
+    for name, value in model.policy.state_dict().items():
         if "_target" in name:
             continue
         if ".head." in name or name.startswith(("latent_model.projection.", "latent_model.predictor.")):
@@ -284,12 +210,11 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
             kinds["perturbed"] += 1
     assert min(kinds.values()) > 0
     assert len(model.policy.optimizer.state) == 0
-    for online_part, target_part in (*model.policy.target_copy.pairs, *model.policy.latent_target_copy.pairs):
-        for a, b in zip(online_part.parameters(), target_part.parameters(), strict=True):
-            assert th.equal(a, b)
-    before = {name: p.clone() for name, p in new.items()}
+    for pair in (*model.policy.target_copy.pairs, *model.policy.latent_target_copy.pairs):
+        assert same(*(list(part.parameters()) for part in pair))
+    before = tensors(model)
     model.learn(8, reset_num_timesteps=False)  # training continues
-    assert untrained(model, before) == [] and all(th.isfinite(p).all() for p in model.policy.parameters())
+    assert untrained(model, before) == [] and all_finite(model)
 
 
 def test_when_resets_happen(make):
@@ -297,40 +222,22 @@ def test_when_resets_happen(make):
     model = make(ChainEnv(), resets={"interval": 12}).learn(90)  # 100 updates in steps 41 to 90, two per step
     assert model._n_updates == 100
     assert model._resets.done == [12, 24, 36, 48, 60, 72, 84]  # after 84, 16 are left; after 96, 4
-    assert make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)._resets.done == [
-        7,
-        14,
-        21,
-        28,
-        35,
-        42,
-        49,
-    ]  # within rounds
-    assert make(ChainEnv()).learn(46)._resets.done == []
+    within_rounds = make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)
+    assert within_rounds._resets.done == [7, 14, 21, 28, 35, 42, 49]
+    postponed = make(ChainEnv(), resets={"interval": 30}).learn(60)  # it is due in the last tenth of the call of learn
+    assert (postponed._n_updates, postponed._resets.done) == (40, [])
+    assert postponed.learn(40, reset_num_timesteps=False)._resets.done == [40, 70]
 
 
-def wait_for_a_longer_window(make):
+def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
     """A reset after 4 updates raises n from 2 to 60, while the buffer has about 45 transitions."""
     model = make(ChainEnv(), n_steps=2, resets={"interval": 4, "annealing_steps": 1}).learn(42)
     assert model._n_updates == 4
     model.resets = replace(model.resets, initial_n_steps=60)
-    return model
-
-
-def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
-    model = wait_for_a_longer_window(make)
     model.learn(8, reset_num_timesteps=False)
     assert model._n_updates == 4 and model._resets.done == [4]
     model.learn(30, reset_num_timesteps=False)
     assert model._n_updates > 4
-
-
-def test_resets_are_postponed_to_the_next_call_of_learn():
-    """A reset due in the last tenth of a call of ``learn`` is done in the next call."""
-    model = make_rainbow(ChainEnv(), resets={"interval": 30}).learn(60)
-    assert (model._n_updates, model._resets.done) == (40, [])
-    model.learn(40, reset_num_timesteps=False)
-    assert model._resets.done == [40, 70]
 
 
 def test_resets_do_not_change_frozen_parameters():
@@ -338,9 +245,9 @@ def test_resets_do_not_change_frozen_parameters():
     frozen = [*model.q_net.features_extractor.parameters(), *model.q_net.head.value[0].parameters()]
     for parameter in frozen:
         parameter.requires_grad_(False)
-    before = [parameter.clone() for parameter in frozen]
+    before = tensors(frozen)
     model.learn(50)
-    assert len(model._resets.done) > 0 and all(th.equal(a, b) for a, b in zip(before, frozen, strict=True))
+    assert len(model._resets.done) > 0 and same(before, frozen)
 
 
 class PolicyWithAnArgument(EqRRainbowPolicy):
@@ -424,18 +331,6 @@ def test_latents_are_scaled_to_the_unit_interval():
     th.testing.assert_close(with_layer(images), with_layer.linear(rescaled(with_layer.trunk(images))))
 
 
-@EITHER
-@BOTH
-@pytest.mark.parametrize("group", ["SE(2)", None])
-def test_trunks_by_name(make, group, network):
-    trunk = {"features_extractor_class": "impala", "features_extractor_kwargs": {"width_scale": 0.25}}
-    model = make(ImageEnv(), "CnnPolicy", policy_kwargs={**network, **trunk, "group": group}, symmetry_coef=0.0).learn(60)
-    encoder = model.policy.online.features_extractor
-    alone = network is PAPER and group is None  # followed by neither a norm nor group elements
-    assert isinstance(encoder if alone else encoder.trunk, ImpalaExtractor)
-    assert all(th.isfinite(p).all() for p in model.policy.parameters())
-
-
 def test_custom_filters():
     """Such as the two 5x5 convolutions of data-efficient Rainbow."""
     space = ImageEnv((4, 84, 84)).observation_space
@@ -443,9 +338,3 @@ def test_custom_filters():
     assert extractor.features_dim == 64 * 3 * 3
     with pytest.raises(ValueError, match=r"at least 25x25 pixels, got \(4, 24, 24\)"):
         ConvExtractor(ImageEnv((4, 24, 24)).observation_space, layers=[[32, 5, 5], [64, 5, 5]])
-
-
-def test_no_warning_about_greedy_exploration_with_resets():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        make_rainbow(ChainEnv(), resets={"interval": 100}, policy_kwargs={"noisy": False})

@@ -5,7 +5,6 @@ import io
 import json
 import pathlib
 import pickle
-import subprocess
 import sys
 import warnings
 import zipfile
@@ -16,52 +15,47 @@ import pytest
 import torch as th
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import SimpleMultiObsEnv
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, SequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, EqRRainbow, SequenceReplayBuffer
 from sb3_eqr.common.saving.files import seal
-from tests.models import EITHER, MAKERS, loss_terms
-from tests.resume import Save, make_env
-from tests.toys import ChainEnv, DictEnv, ImageEnv
-
-POLICIES = pytest.mark.parametrize(
-    "policy, env", [("MlpPolicy", ChainEnv), ("CnnPolicy", ImageEnv), ("MultiInputPolicy", SimpleMultiObsEnv)]
-)
+from tests.models import EITHER, MAKERS, POLICIES, loss_terms, same, tensors
+from tests.toys import ChainEnv, ImageEnv
 
 
-def equal_states(a, b):
-    return a.keys() == b.keys() and all(th.equal(a[key], b[key]) for key in a)
+def same_moments(*models):
+    one, other = (model.policy.optimizer.state_dict()["state"] for model in models)
+    return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
 
 
 @POLICIES
 @pytest.mark.parametrize("switches", [{}, {"policy_kwargs": {"noisy": False, "dueling": False}, "prediction_depth": 0}])
 def test_save_and_load(make, policy, env, switches, tmp_path):
     model = make(env(), policy, **switches).learn(46)
-    observations = np.concatenate([model.get_env().reset()]) if policy != "MultiInputPolicy" else model.get_env().reset()
+    observations = model.get_env().reset()
     actions, _ = model.predict(observations, deterministic=True)
     model.save(tmp_path / "model.zip")
     loaded = make.algorithm.load(tmp_path / "model.zip", env=env())
-    assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
-    assert np.array_equal(loaded.predict(observations, deterministic=True)[0], actions)
-    a, b = model.policy.optimizer.state_dict(), loaded.policy.optimizer.state_dict()
-    assert a["param_groups"] == b["param_groups"]
-    for key, state in a["state"].items():
-        assert equal_states(state, b["state"][key])
+    assert same(model, loaded) and np.array_equal(loaded.predict(observations, deterministic=True)[0], actions)
+    assert model.policy.optimizer.state_dict()["param_groups"] == loaded.policy.optimizer.state_dict()["param_groups"]
+    assert same_moments(model, loaded)
     loaded.learn(44)  # training continues
-    assert make.algorithm.load(tmp_path / "model").predict(observations, deterministic=True)[0].tolist() == actions.tolist()
+    model.policy.save(str(tmp_path / "policy"))
+    model.policy.online.save(str(tmp_path / "net"))
+    alone = type(model.policy).load(str(tmp_path / "policy"))
+    assert type(alone) is type(model.policy) and same(model, alone)
+    for part in (make.algorithm.load(tmp_path / "model"), alone, type(model.policy.online).load(str(tmp_path / "net"))):
+        assert np.array_equal(part.predict(observations, deterministic=True)[0], actions)
 
 
-def test_save_and_load_by_file_object(make):
-    model = make(ChainEnv()).learn(46)
-    file = io.BytesIO()
-    model.save(file)
+def test_save_and_load_by_file_object(make, model):
+    model.save(file := io.BytesIO())
     model.save_replay_buffer(buffer := io.BytesIO())
     file.seek(0)
     buffer.seek(0)
     loaded = make.algorithm.load(file, env=ChainEnv())
-    assert equal_states(model.policy.state_dict(), loaded.policy.state_dict())
+    assert same(model, loaded)
     loaded.load_replay_buffer(buffer)
     assert loaded.replay_buffer.size() == 46
 
@@ -93,12 +87,8 @@ def test_options_can_be_changed_on_loading(make, tmp_path):
     assert type(loaded.replay_buffer) is SequenceReplayBuffer
     loaded.learn(46)
     assert loaded.replay_buffer.n_steps == 5
-    for change in (
-        {"symmetry_coef": 0.0},
-        {"reward_coef": 0.0},
-        {"prediction_depth": 0},
-        {"aet_coef": 0.0, "double_q": False},
-    ):
+    off = ({"symmetry_coef": 0.0}, {"reward_coef": 0.0}, {"prediction_depth": 0}, {"aet_coef": 0.0, "double_q": False})
+    for change in off:
         make.algorithm.load(tmp_path / "model", env=ChainEnv(), **change).learn(46)
     make(ChainEnv(), prediction_depth=0).save(tmp_path / "plain")
     richer = make.algorithm.load(tmp_path / "plain", env=ChainEnv(), prediction_depth=3).learn(46)
@@ -127,15 +117,13 @@ def test_set_env_and_different_numbers_of_environments(make, tmp_path):
         make.algorithm.load(tmp_path / "model", env=ImageEnv())
 
 
-def test_set_parameters(make, tmp_path):
-    model, other = make(ChainEnv()).learn(46), make(ChainEnv(), seed=1)
-    assert not equal_states(model.policy.state_dict(), other.policy.state_dict())
+def test_set_parameters(make, model, tmp_path):
+    other, third = make(ChainEnv(), seed=1), make(ChainEnv(), seed=2)
+    assert not same(model, other)
     other.set_parameters(model.get_parameters())
-    assert equal_states(model.policy.state_dict(), other.policy.state_dict())
     model.save(tmp_path / "model")
-    third = make(ChainEnv(), seed=2)
     third.set_parameters(str(tmp_path / "model"))
-    assert equal_states(model.policy.state_dict(), third.policy.state_dict())
+    assert same(model, other) and same(model, third)
 
     parameters = model.get_parameters()
     missing = deepcopy(parameters)
@@ -151,14 +139,11 @@ def test_set_parameters(make, tmp_path):
         other.set_parameters({**parameters, "actor": {}})
     with pytest.raises(ValueError, match="Names of parameters do not match"):
         other.set_parameters({"policy": parameters["policy"]})
-
-
-def test_set_parameters_that_fails_changes_nothing(make):
-    model, other = make(ChainEnv()).learn(46), make(ChainEnv(), seed=1, policy_kwargs={"latent_hidden_dim": 24})
-    before = deepcopy(other.policy.state_dict())
+    wider = make(ChainEnv(), policy_kwargs={"latent_hidden_dim": 24})
+    before = tensors(wider)
     with pytest.raises(RuntimeError, match="size mismatch"):
-        other.set_parameters(model.get_parameters())
-    assert equal_states(before, other.policy.state_dict())
+        wider.set_parameters(parameters)
+    assert same(before, wider)  # a call that fails changes nothing
 
 
 @EITHER
@@ -166,15 +151,14 @@ def test_the_optimisers_averages_get_the_memory_layout_of_their_parameters(make)
     """PyTorch's fused Adam reads both in the order of memory."""
     model = make(ImageEnv(), "CnnPolicy").learn(44)
     parameters = deepcopy(model.get_parameters())
-    averages = [state["exp_avg"] for state in parameters["policy.optimizer"]["state"].values()]
-    expected = [average.clone() for average in averages]
+    expected = [state["exp_avg"].clone() for state in parameters["policy.optimizer"]["state"].values()]
     for state in parameters["policy.optimizer"]["state"].values():
         state["exp_avg"] = state["exp_avg"].contiguous()
     model.set_parameters(parameters)
-    found = [(p, state["exp_avg"]) for p, state in model.policy.optimizer.state.items()]
-    assert any(not p.is_contiguous() for p, _ in found)  # channels last
-    for (parameter, average), wanted in zip(found, expected, strict=True):
-        assert average.stride() == parameter.stride() and th.equal(average, wanted)
+    found = {p: state["exp_avg"] for p, state in model.policy.optimizer.state.items()}
+    assert any(not p.is_contiguous() for p in found)  # channels last
+    assert [p.stride() for p in found] == [average.stride() for average in found.values()]
+    assert same(list(found.values()), expected)
 
 
 def is_copied(name):
@@ -205,39 +189,6 @@ def test_after_another_dtype_targets_follow_the_new_tensors(make):
     assert n_statistics > 0 and n_averaged > 0
 
 
-@POLICIES
-def test_policies_alone(make, policy, env, tmp_path):
-    model = make(env(), policy).learn(46)
-    obs = model.get_env().reset()
-    expected = model.predict(obs, deterministic=True)[0]
-    model.policy.save(str(tmp_path / "policy"))
-    loaded = type(model.policy).load(str(tmp_path / "policy"))
-    assert type(loaded) is type(model.policy)
-    assert equal_states(model.policy.state_dict(), loaded.state_dict())
-    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], expected)
-    model.policy.online.save(str(tmp_path / "net"))
-    net = type(model.policy.online).load(str(tmp_path / "net"))
-    assert np.array_equal(net.predict(obs, deterministic=True)[0], expected)
-
-
-def test_a_loaded_agent_reads_the_keys_of_a_dict_in_the_same_order(make, tmp_path):
-    model = make(DictEnv(), "MultiInputPolicy").learn(46)
-    model.save(tmp_path / "agent")
-    loaded = type(model).load(tmp_path / "agent")
-    observation = {"velocity": np.linspace(-1, 1, 20)[:, None], "angle": np.linspace(1, 0, 20)[:, None]}
-    observation = {key: value.astype(np.float32) for key, value in observation.items()}
-    tensors = {key: th.as_tensor(value) for key, value in observation.items()}
-    assert th.equal(loaded.policy.online(tensors), model.policy.online(tensors))
-
-
-def test_a_custom_group_is_saved(make, tmp_path):
-    group = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
-    model = make(ChainEnv(), policy_kwargs={"group": group}).learn(46)
-    model.save(tmp_path / "model")
-    loaded = make.algorithm.load(tmp_path / "model", env=ChainEnv()).learn(46)
-    assert str(loaded.policy.latent_model.group) == str(group)
-
-
 def test_a_loaded_replay_buffer_keeps_the_models_beta(make, tmp_path):
     make(ChainEnv()).learn(46).save_replay_buffer(tmp_path / "buffer")
     model = make(ChainEnv(), replay_buffer_kwargs={"beta": 0.9, "final_beta": 0.8})
@@ -247,47 +198,37 @@ def test_a_loaded_replay_buffer_keeps_the_models_beta(make, tmp_path):
     assert model.replay_buffer.beta == pytest.approx(0.8, abs=0.02)
 
 
-def test_a_loaded_replay_buffer_replaces_the_models(make, tmp_path):
-    model = make(ChainEnv()).learn(46)
-    model.save_replay_buffer(tmp_path / "buffer")
-    old = model.replay_buffer
+def test_a_resumed_run_equals_an_uninterrupted_one(make, tmp_path):
+    """Saved after 80 of 160 steps, with one reset before and one after, while n, γ, ε and the learning rate are annealed."""
+    resets = {"interval": 30, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 45}
+    network = {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}}
+    settings = {"buffer_size": 120, "exploration_fraction": 0.8, "learning_rate": lambda p: 1e-3 * p, "tau": 0.05}
+    whole = make(make_vec_env(ChainEnv, 2), **settings, resets=resets, policy_kwargs=network)
+    states = []
+
+    class Save(BaseCallback):
+        """Between two rounds of the training loop, after an update and before the next step."""
+
+        def _on_rollout_start(self):
+            if self.num_timesteps == 80:
+                whole.save(tmp_path / "model")
+                whole.save_replay_buffer(tmp_path / "buffer")
+                states.extend(whole.get_env().env_method("state_dict"))
+
+        def _on_step(self):
+            return True
+
+    whole.learn(160, Save())
+    env = make_vec_env(ChainEnv, 2)
+    env.reset()  # Monitor requires it
+    for index, state in enumerate(states):
+        env.env_method("load_state_dict", state, indices=index)
+    model = make.algorithm.load(tmp_path / "model", env, "cpu", force_reset=False, trust=True)  # it has a pickled lambda
     model.load_replay_buffer(tmp_path / "buffer")
-    for name in ("actions", "rewards", "dones", "timeouts"):
-        assert np.array_equal(getattr(old, name), getattr(model.replay_buffer, name))
-    model.learn(60, reset_num_timesteps=False)
-
-
-KNOBS = {  # one reset before the file is written and one after; n and γ are being annealed
-    "resets": {"interval": 30, "initial_n_steps": 6, "initial_gamma": 0.9, "annealing_steps": 45},
-    "tau": 0.05,
-    "policy_kwargs": {"act_with_target": True, "optimizer_class": "AdamW", "optimizer_kwargs": {"weight_decay": 0.1}},
-}
-
-
-@pytest.mark.parametrize(
-    "make, normalize, knobs",
-    [
-        pytest.param(MAKERS[0], False, {}, marks=pytest.mark.slow),
-        pytest.param(MAKERS[1], True, {}, marks=pytest.mark.slow),
-        (MAKERS[1], False, KNOBS),
-    ],
-    indirect=["make"],
-)
-def test_a_resumed_run_equals_an_uninterrupted_one(make, normalize, knobs, tmp_path):
-    """Saved after 80 of 160 steps, loaded and continued in a new process, it has the same parameters, bit for bit."""
-    model = make(make_env(normalize), buffer_size=120, exploration_fraction=0.8, learning_rate=lambda p: 1e-3 * p, **knobs)
-    model.learn(160, callback=Save(tmp_path, at=80))
-    command = [sys.executable, "-m", "tests.resume", make.algorithm.__name__, str(tmp_path), "80"]
-    subprocess.run(command, check=True, timeout=120)
-    continued = make.algorithm.load(tmp_path / "continued", device="cpu", trust=True)
-    halfway = make.algorithm.load(tmp_path / "model", device="cpu", trust=True)
-    assert continued.num_timesteps == 160 and continued._n_updates == model._n_updates
-    assert continued._resets.done == model._resets.done == ([30, 60] if knobs else [])
-    assert halfway._resets.done == model._resets.done[:1]
-    assert equal_states(model.policy.state_dict(), continued.policy.state_dict())
-    assert not equal_states(model.policy.state_dict(), halfway.policy.state_dict())
-    a, b = model.policy.optimizer.state_dict()["state"], continued.policy.optimizer.state_dict()["state"]
-    assert all(equal_states(a[key], b[key]) for key in a)
+    assert model._resets.done == [30] and not same(model, whole)
+    model.learn(80, reset_num_timesteps=False)
+    assert model.num_timesteps == 160 and model._n_updates == whole._n_updates and model._resets.done == [30, 60]
+    assert same(model, whole) and same_moments(model, whole)
 
 
 # ---------------------------------------------------------------------------------------------- wrong files
@@ -297,9 +238,7 @@ def test_a_file_of_another_class(make, tmp_path):
     for algorithm in (QRDQN, DQN):
         algorithm("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save(tmp_path / "stock")
         for trust in (False, True):  # the error must not suggest trusting a file that cannot be loaded
-            with pytest.raises(
-                ValueError, match=r"stock must be a file written by EqR\w+\.save, got an agent with a policy of \S+qn"
-            ):
+            with pytest.raises(ValueError, match=r"stock must be a file written by EqR\w+\.save, got an agent .* of \S+qn"):
                 make.algorithm.load(tmp_path / "stock", env=ChainEnv(), trust=trust)
 
 
@@ -310,13 +249,9 @@ def test_the_agents_reject_each_others_files(tmp_path):
 
 
 def test_parameters_for_another_support(tmp_path):
-    kwargs = {"buffer_size": 100, "device": "cpu"}
-    model = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs)
-    model.save(tmp_path / "model")
-    other = EqRRainbow("MlpPolicy", ChainEnv(), **kwargs, policy_kwargs={"v_max": 100.0})
-    with pytest.raises(
-        ValueError, match=r"support: parameters must be for '\[-10.0, 100.0\]', got parameters for '\[-10.0, 10.0\]'"
-    ):
+    MAKERS[1](ChainEnv()).save(tmp_path / "model")
+    other = MAKERS[1](ChainEnv(), policy_kwargs={"v_max": 100.0})
+    with pytest.raises(ValueError, match=r"support: .* for '\[-10.0, 100.0\]', got parameters for '\[-10.0, 10.0\]'"):
         other.set_parameters(str(tmp_path / "model"))
     other.save(tmp_path / "other")
     loaded = EqRRainbow.load(tmp_path / "other")
@@ -330,10 +265,10 @@ def test_parameters_of_another_group(make, tmp_path):
     twisted = make(ChainEnv(), policy_kwargs={"group": "SE(2)", "n_blocks": 4, "parameterization": "exp"}, prediction_depth=0)
     model.save(tmp_path / "model")
     for wrong in (other, twisted):
-        before = {name: p.clone() for name, p in wrong.policy.state_dict().items()}
+        before = tensors(wrong)
         with pytest.raises(ValueError, match=r"group: parameters must be for .*, got parameters for 'SE\(2\)\^4, euler'"):
             wrong.set_parameters(str(tmp_path / "model"))
-        assert equal_states(before, wrong.policy.state_dict())
+        assert same(before, wrong)
     with pytest.raises(ValueError, match="policy kwargs"):
         make.algorithm.load(tmp_path / "model", policy_kwargs={"group": "T(2)"})
     with pytest.raises(ValueError, match="got parameters for 'SE"):
@@ -341,8 +276,7 @@ def test_parameters_of_another_group(make, tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_truncated_files(make, share, tmp_path):
-    model = make(ChainEnv()).learn(46)
+def test_truncated_files(make, model, share, tmp_path):
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     for name in ("model.zip", "buffer.pkl"):
@@ -356,8 +290,7 @@ def test_truncated_files(make, share, tmp_path):
     assert model.replay_buffer is buffer
 
 
-def test_a_flipped_byte_is_detected_anywhere(make, tmp_path):
-    model = make(ChainEnv()).learn(46)
+def test_a_flipped_byte_is_detected_anywhere(model, tmp_path):
     model.save_replay_buffer(tmp_path / "buffer")
     path, buffer = tmp_path / "buffer.pkl", model.replay_buffer
     content = path.read_bytes()
@@ -370,20 +303,16 @@ def test_a_flipped_byte_is_detected_anywhere(make, tmp_path):
     assert model.replay_buffer is buffer
 
 
-def test_a_buffer_can_be_loaded_into_a_model_without_one(make, tmp_path):
-    model = make(ChainEnv()).learn(46)
+def test_a_loaded_replay_buffer_replaces_the_models(model, tmp_path):
+    """Also in a model without one; it warns if the file is from another step."""
     model.save_replay_buffer(tmp_path / "buffer")
-    rewards, model.replay_buffer = model.replay_buffer.rewards.copy(), None
-    model.load_replay_buffer(tmp_path / "buffer")
-    assert (model.replay_buffer.rewards == rewards).all()
-
-
-def test_a_buffer_from_a_different_step_warns(make, tmp_path):
-    model = make(ChainEnv()).learn(46)
-    model.save_replay_buffer(tmp_path / "buffer")
+    old, model.replay_buffer = model.replay_buffer, None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model.load_replay_buffer(tmp_path / "buffer")
+        for _ in range(2):
+            model.load_replay_buffer(tmp_path / "buffer")
+            for name in ("actions", "rewards", "dones", "timeouts"):
+                assert np.array_equal(getattr(old, name), getattr(model.replay_buffer, name))
     model.learn(4, reset_num_timesteps=False)
     with pytest.warns(UserWarning, match="saved at step 46, but the model is at step 50"):
         model.load_replay_buffer(tmp_path / "buffer")
@@ -394,27 +323,35 @@ class Runs:
         return pathlib.Path.touch, (pathlib.Path("ran"),)
 
 
-def test_loading_executes_no_code(make, tmp_path, monkeypatch):
+def members_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def rewrite(source, path, **changes):
+    """Change members of a zip file, and seal it again, as an attacker can."""
+    members = members_of(source) | changes
+    with open(path, "wb+") as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, content)
+        seal(file)
+
+
+def test_loading_executes_no_code(make, model, tmp_path, monkeypatch):
     """Pickles in place of every file, and inside a model."""
     monkeypatch.chdir(tmp_path)
-    model = make(ChainEnv()).learn(46)
     model.save("model")
-    with zipfile.ZipFile("model.zip") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
     evil = pickle.dumps(Runs())
-    data = json.loads(members["data"])
+    data = json.loads(members_of("model.zip")["data"])
     forged = {":serialized:": base64.b64encode(evil).decode()}
     for name in ("policy_class", "verbose", "anything"):
-        with zipfile.ZipFile("forged.zip", "w") as archive:
-            for member, content in members.items():
-                archive.writestr(member, json.dumps({**data, name: forged}) if member == "data" else content)
+        rewrite("model.zip", "forged.zip", data=json.dumps({**data, name: forged}))
         for load in (make.algorithm.load, lambda path: make.algorithm.load(path, env=ChainEnv())):
             with pytest.raises(ValueError, match="pass trust=True"):
                 load("forged")
         model.set_parameters("forged")  # does not read attributes
-    with zipfile.ZipFile("weights.zip", "w") as archive:
-        for member, content in members.items():
-            archive.writestr(member, evil if member == "policy.pth" else content)
+    rewrite("model.zip", "weights.zip", **{"policy.pth": evil})
     for load in (make.algorithm.load, model.set_parameters, model.load_representation):
         with pytest.raises(Exception, match=r"weights_only|Weights only"):
             load("weights")
@@ -428,14 +365,11 @@ def test_loading_executes_no_code(make, tmp_path, monkeypatch):
     assert not pathlib.Path("ran").exists()
 
 
-def test_files_that_are_not_replay_buffers_of_this_package(make, tmp_path):
-    model = make(ChainEnv()).learn(46)
-    stock = QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu")
-    stock.save_replay_buffer(tmp_path / "stock")
-    images = make(ImageEnv(), "CnnPolicy")
-    images.save_replay_buffer(tmp_path / "images")
-    other_kind = EqRRainbow if make.algorithm is EqRQRDQN else EqRQRDQN
-    other_kind("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "relative")
+def test_files_that_are_not_replay_buffers_of_this_package(make, model, tmp_path):
+    QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "stock")
+    make(ImageEnv(), "CnnPolicy").save_replay_buffer(tmp_path / "images")
+    relative = next(maker for maker in MAKERS if maker is not make)
+    relative(ChainEnv()).save_replay_buffer(tmp_path / "relative")
     for name in ("stock", "images", "relative"):
         with pytest.raises(ValueError, match=r"must be a (complete )?replay buffer"):
             model.load_replay_buffer(tmp_path / name, trust=True)
@@ -463,29 +397,14 @@ def test_a_save_that_fails_leaves_the_old_file(make, tmp_path, monkeypatch):
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
 
-def rewritten(path, **changes):
-    """Change attributes in a saved file, and seal it again, as an attacker can."""
-    with zipfile.ZipFile(path) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    parts["data"] = json.dumps({**json.loads(parts["data"]), **changes}).encode()
-    with open(path, "wb+") as file:
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, content in parts.items():
-                archive.writestr(name, content)
-        seal(file)
-
-
 @EITHER
 @pytest.mark.parametrize("as_object", [False, True])
 def test_a_file_cannot_name_an_environment_to_make(make, as_object, tmp_path):
     """``gym.make`` imports the module in "module:Name-v0"."""
-    make(ChainEnv()).save(tmp_path / "model")
-    rewritten(tmp_path / "model.zip", env="antigravity:CartPole-v1")
-    if as_object:
-        with open(tmp_path / "model.zip", "rb") as file:
-            loaded = make.algorithm.load(file)
-    else:
-        loaded = make.algorithm.load(tmp_path / "model")
+    make(ChainEnv()).save(path := tmp_path / "model.zip")
+    data = json.loads(members_of(path)["data"])
+    rewrite(path, path, data=json.dumps({**data, "env": "antigravity:CartPole-v1"}))
+    loaded = make.algorithm.load(io.BytesIO(path.read_bytes()) if as_object else path)
     assert loaded.env is None and "antigravity" not in sys.modules
 
 
@@ -503,16 +422,15 @@ def test_every_way_to_write_a_path_is_checked(make, ending, tmp_path, monkeypatc
 
 
 @EITHER
-def test_moments_of_another_shape_are_refused(make):
+def test_moments_of_another_shape_are_refused(make, model):
     """SB3 loads them, and fused Adam then writes beyond their memory."""
-    model = make(ChainEnv()).learn(46)
     parameters = deepcopy(model.get_parameters())
     first = parameters["policy.optimizer"]["state"][0]
     first["exp_avg"] = first["exp_avg"].flatten()[:1].clone()
-    before = [p.clone() for p in model.policy.parameters()]
+    before = tensors(model)
     with pytest.raises(ValueError, match=r"exp_avg of the optimiser must have the shape of its parameter, .*, got \(1,\)"):
         model.set_parameters(parameters)
-    assert all(th.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
+    assert same(before, model)
     model.learn(4, reset_num_timesteps=False)
 
 

@@ -3,7 +3,6 @@
 import copy
 import inspect
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -16,8 +15,8 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common import objective
 from sb3_eqr.common.networks.encoders import NormalizedExtractor
-from tests.models import EITHER, MAKERS, PAPER, loss_terms, train_on
-from tests.toys import ChainEnv, ImageEnv
+from tests.models import EITHER, MAKERS, PAPER, loss_terms, tensors, train_on
+from tests.toys import ChainEnv, ImageEnv, SampledEnv
 
 
 def trained_model(make, **kwargs):
@@ -153,18 +152,16 @@ def test_an_update_sees_normalised_observations_and_rewards(make, monkeypatch):
 def test_replay_weights_multiply_every_loss(make):
     model = trained_model(make, max_grad_norm=None, learning_rate=1e-3)
     samples = model.replay_buffer.sample(8)
-    model.policy.set_training_mode(True)
+    before = tensors(model)
 
     def gradients(weights):
+        model.policy.load_state_dict(before)
         th.manual_seed(0)
         train_on(model, samples._replace(weights=weights))
         return [p.grad.clone() for p in model._trained]
 
-    states = {name: p.clone() for name, p in model.policy.state_dict().items()}
     full = gradients(th.ones(8))
-    model.policy.load_state_dict(states)
     half = gradients(th.full((8,), 0.5))
-    model.policy.load_state_dict(states)
     none = gradients(th.zeros(8))
     assert all(th.isfinite(g).all() and g.abs().sum() > 0 for g in full)
     for f, h, n in zip(full, half, none, strict=True):
@@ -173,10 +170,9 @@ def test_replay_weights_multiply_every_loss(make):
 
 
 def test_the_loss_is_the_weighted_mean_of_its_terms(make):
-    model = trained_model(make)
+    model = trained_model(make, td_coef=2.0, aet_coef=0.5, symmetry_coef=0.25, reward_coef=3.0)
     samples = model.replay_buffer.sample(8)._replace(weights=th.rand(8))
-    coefs = {"td": 2.0, "aet": 0.5, "symmetry": 0.25, "reward": 3.0}
-    losses, loss, *_ = model.objective(samples, coefs)
+    losses, loss, *_ = loss_terms(model, samples)
     expected = 2.0 * losses["td"] + 0.5 * losses["aet"] + 0.25 * losses["symmetry"] + 3.0 * losses["reward"]
     assert min(losses[name].abs().min() for name in ("td", "aet", "symmetry")) > 0
     th.testing.assert_close(loss, (samples.weights * expected).mean())
@@ -196,11 +192,9 @@ def test_new_priorities_come_from_the_td_loss(make):
     with th.no_grad():
         td = loss_terms(model, samples)
     train_on(model, samples)
-    found = model.replay_buffer._tree.get(samples.indices)
     last = {int(i): b for b, i in enumerate(samples.indices)}  # the last of several samples of a transition counts
-    for index, b in last.items():
-        expected = (td.priorities[b].item() + 1e-6) ** 0.5
-        assert found[list(samples.indices).index(index)] == pytest.approx(expected, rel=1e-5)
+    expected = (td.priorities[list(last.values())] + 1e-6) ** 0.5
+    np.testing.assert_allclose(model.replay_buffer._tree.get(np.array(list(last))), expected, rtol=1e-5)
 
 
 def test_gradients_of_network_and_latent_model_are_clipped_apart(make):
@@ -213,40 +207,36 @@ def test_gradients_of_network_and_latent_model_are_clipped_apart(make):
     assert {*model._trained} == {p for part in parts for p in part.parameters()}
 
 
-class Bandit(gym.Env):
-    """Action 1 has the reward c, action 0 none; one state, without end. With γ = ½, Q of action 1 is 2c."""
-
-    observation_space = spaces.Box(-1, 1, (2,))
-    action_space = spaces.Discrete(2)
-
-    def __init__(self, c):
-        self.c = c
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.ones(2, np.float32), {}
-
-    def step(self, action):
-        return np.ones(2, np.float32), self.c * float(action), False, False, {}
-
-
 def test_large_rewards_are_learned():
+    """Action 1 has the reward c, the others none; one state, without end. With γ = ½, Q of action 1 is 2c."""
     c = 1e3
+
+    class Bandit(ChainEnv):
+        def step(self, action):
+            return self.observe(), c * float(action == 1), False, False, {}
+
+        def observe(self):
+            return np.ones(3, np.float32)
+
     settings = {"gamma": 0.5, "n_steps": 1, "learning_rate": 1e-3, "gradient_steps": 1, "exploration_final_eps": 0.2}
     network = {"net_arch": [256], "latent_hidden_dim": 64}
-    model = MAKERS[0](Bandit(c), **settings, batch_size=16, policy_kwargs=network).learn(400)
+    model = MAKERS[0](Bandit(), **settings, batch_size=16, policy_kwargs=network).learn(400)
     with th.no_grad():
-        quality = model.quantile_net(th.ones(1, 2)).mean(dim=1)[0, 1].item()
+        quality = model.quantile_net(th.ones(1, 3)).mean(dim=1)[0, 1].item()
     assert 1.8 * c < quality < 2.2 * c
+
+
+def calls_of(kind, monkeypatch):
+    """A list that the next calls of a kind of network are added to: the network and the size of the batch."""
+    forward, calls = kind.forward, []
+    monkeypatch.setattr(kind, "forward", lambda self, obs: calls.append((self, len(obs))) or forward(self, obs))
+    return calls
 
 
 @pytest.mark.parametrize("network, encoder", [(PAPER, GroupFeaturesExtractor), ({}, NormalizedExtractor)])
 def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, encoder):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs=network).learn(44)
-    calls = []
-    forward = encoder.forward
-    watched = lambda self, obs: calls.append((self, len(obs))) or forward(self, obs)  # noqa: E731
-    monkeypatch.setattr(encoder, "forward", watched)
+    calls = calls_of(encoder, monkeypatch)
     model.train(1, 8)
     online, target = model.policy.online.features_extractor, model.policy.target.features_extractor
     # s_t with gradient, then s_{t+n} and the rollout. The paper's target is the online network, too, but in eval mode.
@@ -257,9 +247,8 @@ def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, en
 @pytest.mark.parametrize("symmetry_coef, n_encoded", [(0.0, 8 * 2), (1.0, 8 + 8 * 2)])
 def test_the_target_encodes_the_first_state_for_the_get_loss_only(make, monkeypatch, symmetry_coef, n_encoded):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}, symmetry_coef=symmetry_coef).learn(44)
-    encoder, calls = model.policy.latent_encoder, []
-    forward = type(encoder).forward
-    monkeypatch.setattr(type(encoder), "forward", lambda self, obs: calls.append((self, len(obs))) or forward(self, obs))
+    encoder = model.policy.latent_encoder
+    calls = calls_of(type(encoder), monkeypatch)
     model.train(1, 8)
     assert sum(n for network, n in calls if network is encoder) == n_encoded
 
@@ -318,14 +307,15 @@ def test_float_images_keep_their_scale(normalize_images, low, high):
 def test_logged_losses_are_means_over_updates(make):
     """Rounds of one and three updates: each update counts the same."""
     model = make(ChainEnv()).learn(50)
-    model.set_logger(Logger(None, []))
-    seen = []
-    add = model._monitor.add
+    add, seen = model._monitor.add, []
     model._monitor.add = lambda metrics: (seen.append(metrics["loss"].item()), add(metrics))
-    for n in (1, 3):
-        model.train(n, 8)
-    model._log_last_round()
-    assert model.logger.name_to_value["train/loss"] == pytest.approx(np.mean(seen)) and len(seen) == 4
+    for rounds in ([1, 3], [5, 2]):
+        model.set_logger(Logger(None, []))
+        seen.clear()
+        for n in rounds:
+            model.train(n, 8)
+        model._log_last_round()
+        assert model.logger.name_to_value["train/loss"] == pytest.approx(np.mean(seen)) and len(seen) == sum(rounds)
 
 
 def test_the_learning_rate_is_never_negative(make):
@@ -337,23 +327,16 @@ def test_the_learning_rate_is_never_negative(make):
     assert all(group["lr"] >= 0 for group in model.policy.optimizer.param_groups)
 
 
-class Board(gym.Env):
+class Board(SampledEnv):
     """A 7×7 board of bytes, whose one piece is at the edge."""
 
-    observation_space = spaces.Box(0, 255, (7, 7, 3), np.uint8)
-    action_space = spaces.Discrete(2)
+    def __init__(self):
+        super().__init__(spaces.Box(0, 255, (7, 7, 3), np.uint8))
 
-    def board(self):
+    def observe(self):
         found = np.zeros((7, 7, 3), np.uint8)
         found[0, self.np_random.integers(7)] = 255
         return found
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.board(), {}
-
-    def step(self, action):
-        return self.board(), 0.0, False, self.np_random.random() < 0.1, {}
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "CnnPolicy"])

@@ -10,7 +10,7 @@ import yaml
 from stable_baselines3 import DQN
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
-from sb3_eqr.trust import is_plain
+from sb3_eqr.trust import check_zoo_folder, is_plain
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs" / "files.md"
 SMALL = {"buffer_size": 500, "learning_starts": 10, "device": "cpu"}
@@ -128,3 +128,21 @@ def test_one_file_alone_is_checked(hostile, sb3_eqr, missing, tmp_path):
     if missing == "config.yml":
         (beside / "args.yml").write_text("!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [ran]]")
     assert not ran(sb3_eqr, f"enjoy --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render")
+
+
+WRAPPERS = ["sb3_eqr.envs.atari.Atari100kWrapper", "stable_baselines3.common.atari_wrappers.WarpFrame"]
+WRAPPERS += ["sb3_contrib.common.wrappers.TimeFeatureWrapper", "gymnasium.wrappers.FlattenObservation"]
+WRAPPERS += ["rl_zoo3.wrappers.MaskVelocityWrapper", "stable_baselines3.common.vec_env.VecFrameStack"]
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_wrappers_of_kept_libraries_are_allowed(wrapper, tmp_path):
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({"env_wrapper": [{wrapper: {}}]}))
+    check_zoo_folder(tmp_path)
+
+
+@pytest.mark.parametrize("wrapper", ["rl_zoo3.wrappers.np", "gymnasium.wrappers.RecordVideo", "rl_zoo3.wrappersx.Mine"])
+def test_other_names_in_their_place_are_not(wrapper, tmp_path):
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({"env_wrapper": wrapper}))
+    with pytest.raises(ValueError, match=f"that write no files, got {wrapper}"):
+        check_zoo_folder(tmp_path)

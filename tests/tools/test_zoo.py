@@ -1,8 +1,10 @@
 """The interface to RL Zoo: registration, hyperparameter files, error messages."""
 
+import errno
 import importlib.util
 import os
 import re
+import signal
 import subprocess
 import sys
 
@@ -65,6 +67,8 @@ from tests.toys import ChainEnv, DictEnv, ImageEnv
         ("train --algo eqr_qrdqn -n 0", "-n must be >= 1 step, or -1 for the number in the file, got 0"),
         ("train --algo eqr_qrdqn --checkpoint-every 0", "--checkpoint-every must be >= 1 step, got 0"),
         ("train --algo eqr_qrdqn --device cuda:1", "--device is cuda:1, but PyTorch finds no GPU"),
+        ("all_plots -a qrdqn", "all_plots needs -a ALGO ..., -e ENV ... and -f FOLDER"),
+        ("all_plots -a qrdqn -e CartPole -f nowhere", "needs runs on CartPole in nowhere/qrdqn, got none"),
     ],
 )
 def test_wrong_use_prints_an_error(sb3_eqr, line, message):
@@ -184,7 +188,7 @@ def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, tmp_path):
     assert "is already at step 1024. Pass -n above 1024." in sb3_eqr(f"{line} -n 500 --resume {whole}", code=2).err
     shown = sb3_eqr(f"{line} --resume {whole}/checkpoints/checkpoint-000000000512").out
     assert "Resuming at step 512" in shown and "Seed: 1\n" in shown
-    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_3"  # the second run raised, because it had no steps left
+    resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_2"  # the runs that were refused left no folder
     first, second = (EqRQRDQN.load(folder / "CartPole-v1.zip") for folder in (whole, resumed))
     assert first.num_timesteps == second.num_timesteps == 1408  # a round of 128 steps
     for name, parameter in first.policy.state_dict().items():
@@ -255,11 +259,36 @@ def test_evaluations_of_a_run_with_checkpoints_do_not_change_it():
     assert not all(th.equal(value, changed[name]) for name, value in alone.items())
 
 
-def test_configurations_by_name_and_stock_algorithms(sb3_eqr, tmp_path):
+def test_a_disk_that_cannot_be_written_prints_an_error(sb3_eqr, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(tmp_path))
+
+    monkeypatch.setattr("os.makedirs", refuse)
+    shown = sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}", code=2)
+    assert f"train: [Errno 30] Read-only file system: '{tmp_path}'. Free some space, or pass another" in shown.err
+
+
+def test_an_entry_of_ones_own(sb3_eqr, tmp_path):
     (tmp_path / "own.yml").write_text(f"{ENTRY} frame_stack: 3, policy_kwargs: {{v_max: 100.0}}}}")
     sb3_eqr(f"train --algo eqr_rainbow --env CartPole-v1 --conf-file {tmp_path}/own.yml --eval-freq -1 -f {tmp_path}")
     model = EqRRainbow.load(tmp_path / "eqr_rainbow" / "CartPole-v1_1" / "CartPole-v1.zip")
     assert model.policy.v_max == 100 and model.observation_space.shape == (3 * 4,)
+
+
+def test_a_signal_to_end_saves_the_agent_and_one_before_training_leaves_no_folder(sb3_eqr, tmp_path, monkeypatch):
+    line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 900 -params learning_starts:100 --eval-freq -1 -f {tmp_path}"
+    monkeypatch.setattr(EqRQRDQN, "train", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    shown = sb3_eqr(line)
+    assert "EqRQRDQN: SO(3)^12, euler; auxiliary losses: AET 2, by " in shown.out
+    model = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip")
+    assert 100 < model.num_timesteps < 900
+    monkeypatch.setattr(EqRQRDQN, "_setup_model", lambda *_: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(KeyboardInterrupt):
+        sb3_eqr(line)
+    assert not (tmp_path / "eqr_qrdqn" / "CartPole-v1_2").exists()
+
+
+def test_configurations_by_name_and_stock_algorithms():
     assert find_hyperparameters("eqr_rainbow", "eqr_bbf") == str(configuration_files()["eqr_bbf"])
     assert find_hyperparameters("qrdqn", None) is None
 
@@ -393,6 +422,10 @@ def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     line = "train --algo eqr_rainbow --env MinAtar/Breakout-v1 -n 30 --seed 1 -params learning_starts:25 buffer_size:100"
     shown = sb3_eqr(f"{line} -optimize --n-trials 1 --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}")
     assert "Number of finished trials:  1" in shown.out
+    entry = yaml.safe_load(shown.out.partition("As hyperparameters in a YAML file:")[2])
+    layers = {"features_extractor_kwargs": {"layers": [[16, 3, 1]]}}
+    assert entry["policy_kwargs"].items() >= layers.items() and {"gamma", "gradient_steps"} <= entry.keys()
+    assert [path.suffix for path in (tmp_path / "eqr_rainbow").iterdir() if path.is_dir()] == []  # no run to play
 
 
 def test_minatar_is_deterministic_with_a_seed():

@@ -37,16 +37,14 @@ def timed(env):
     return wrappers.TimeAwareObservation(wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env)))
 
 
+IDS = ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "StarField-v0")
 WORLDS = {
     "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 4, seed)),
     "processes": lambda seed: VecNormalize(
         make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
     ),
     "statistics": lambda seed: VecMonitor(DummyVecEnv([lambda: timed(gym.make("CartPole-v1"))])),
-    **{
-        name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1")
-    },
-    **{name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in ("Taxi-v4", "CliffWalking-v1", "StarField-v0")},
+    **{name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in IDS},
     "chain": lambda seed: make_vec_env(ChainEnv, 2, seed),
     "torus": lambda seed: make_vec_env("SlidingBallTorus-v0", 2, seed, env_kwargs=TORUS),
     "pendulum": lambda seed: VecFrameStack(make_vec_env("PixelPendulum-v0", 2, seed), 4),
@@ -120,9 +118,7 @@ def test_a_different_environment_raises():
     flat = make_vec_env("CartPole-v1", 1, wrapper_class=gym.wrappers.FlattenObservation)
     for env in (first, flat):
         env.reset()
-    with pytest.raises(
-        ValueError, match=r"env must be FlattenObservation in Monitor in .* got Monitor in .* is not built as in"
-    ):
+    with pytest.raises(ValueError, match=r"env must be FlattenObservation in .* got Monitor in .* is not built as in"):
         restore(first, capture(flat)[0], wrappers_only=False)
     with pytest.raises(ValueError, match="n_envs must be 1, as in the original run, got 2"):
         restore(make_vec_env("CartPole-v1", 2), capture(first)[0], wrappers_only=False)
