@@ -344,7 +344,10 @@ def test_notebooks_run_and_have_outputs(notebook, shortened):
 STORY = [  # lines of the pages in a working order, and arguments that shorten them by overriding earlier ones
     ("sb3-eqr train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 5000", "-n 400 --eval-freq 200 --eval-episodes 2"),
     ("sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render", "-n 50"),
-    ("sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn qrdqn:stock --seeds 2", "--steps 300 --seeds 1"),
+    (
+        "sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2",
+        "--steps 300 --seeds 1",
+    ),
     ("sb3-eqr benchmark status results/smoke", ""),
     ("sb3-eqr benchmark report results/smoke", ""),
     ("python examples/demo.py --game Boxing --config se2+aet --steps 100000", "--steps 30 --eval-episodes 1"),
