@@ -232,14 +232,12 @@ def check_script(call, arguments):
             raise Understood(parse_args(self, args, namespace))
 
         patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
-        patch.setattr(zoo_command, "check_trained", lambda args: None)  # nothing is trained here
-        patch.setattr(zoo_command, "check_trained_agent", lambda path: None)
-        patch.setattr(zoo_command, "check_runs", lambda arguments: None)
+        for name in ("check_trained", "check_trained_agent", "check_runs", "save_where_nothing_is_shown"):
+            patch.setattr(zoo_command, name, lambda argument: None)  # nothing is trained here
         for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # commands replace them for good
             patch.setattr(module, name, getattr(module, name))
         patch.setattr("huggingface_sb3.push_to_hub.generate_metadata", None, raising=False)
         patch.setattr(sb3_eqr.zoo.hub, "provide_ffmpeg", lambda: None)
-        patch.setattr(zoo_command, "save_where_nothing_is_shown", lambda command: None)
         patch.setattr(sys, "argv", ["command", *arguments])
         try:
             with warnings.catch_warnings():
@@ -346,7 +344,10 @@ def test_notebooks_run_and_have_outputs(notebook, shortened):
 STORY = [  # lines of the pages in a working order, and arguments that shorten them by overriding earlier ones
     ("sb3-eqr train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 5000", "-n 400 --eval-freq 200 --eval-episodes 2"),
     ("sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render", "-n 50"),
-    ("sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn qrdqn:stock --seeds 2", "--steps 300 --seeds 1"),
+    (
+        "sb3-eqr benchmark run results/smoke --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2",
+        "--steps 300 --seeds 1",
+    ),
     ("sb3-eqr benchmark status results/smoke", ""),
     ("sb3-eqr benchmark report results/smoke", ""),
     ("python examples/demo.py --game Boxing --config se2+aet --steps 100000", "--steps 30 --eval-episodes 1"),
@@ -372,12 +373,8 @@ def test_commands_run(tmp_path):
             command = [str(pathlib.Path(sys.executable).parent / program), *arguments]
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, f"{line} {changes}\n{done.stdout}\n{done.stderr}"
-    for path in (
-        "logs/eqr_qrdqn",
-        "results/smoke/report/report.html",
-        "demo_results/Boxing-se2+aet/training.png",
-        "cliffwalk.json",
-    ):
+    results = ("logs/eqr_qrdqn", "results/smoke/report/report.html", "demo_results/Boxing-se2+aet/training.png")
+    for path in (*results, "cliffwalk.json"):
         assert (tmp_path / path).exists(), path
 
 

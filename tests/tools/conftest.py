@@ -35,3 +35,12 @@ def register(monkeypatch):
         return env_id
 
     return call
+
+
+@pytest.fixture
+def own_extractor(tmp_path, monkeypatch):
+    """A features extractor that only the user's module has, as an expression of ``policy_kwargs``."""
+    code = "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
+    (tmp_path / "my_extractor.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    return "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_extractor').Mine)"

@@ -445,13 +445,10 @@ def test_two_commands_can_plan_games_in_one_folder(tmp_path, monkeypatch):
     assert sorted(read_suite(tmp_path / SUITE).games) == sorted(games)
 
 
-def test_an_agent_with_a_class_of_its_own_resumes(tmp_path, monkeypatch):
+def test_an_agent_with_a_class_of_its_own_resumes(own_extractor, tmp_path):
     """Its checkpoint holds a pickle of the class, which the entry has already run."""
-    code = "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
-    (tmp_path / "my_extractor.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path)
-    own = "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_extractor').Mine)"
-    entry = f'{{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, policy_kwargs: "{own}"}}'
+    entry = "{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, "
+    entry += f'policy_kwargs: "{own_extractor}"}}'
     run = make_run(tmp_path, "eqr_qrdqn", entry)
     interrupt(run, 100)
     assert execute(run, Settings()) == "finished" and result_of(run)["resumed_exactly"]

@@ -6,33 +6,17 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_eqr import EqRRainbow, load_configuration
 from sb3_eqr.common.groups import make_group
+from sb3_eqr.common.saving.plain_data import encode as encode_plain
 from sb3_eqr.common.saving.random_state import get_rng_state
 from sb3_eqr.visualize import film as film_module
 from sb3_eqr.visualize.callback import LatentCallback
-from sb3_eqr.visualize.film import (
-    ARROW,
-    AXES,
-    HEIGHT,
-    ROOM,
-    WIDTH,
-    Painter,
-    Panel,
-    in_plane,
-    moved,
-    observed_pictures,
-    panel,
-    panels,
-    predictions,
-    record,
-    shoot,
-)
+from sb3_eqr.visualize.film import ARROW, AXES, HEIGHT, ROOM, WIDTH, Painter, Panel, panel, panels, record, shoot
 from sb3_eqr.visualize.latents import encode
 from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
@@ -54,14 +38,14 @@ def test_an_arrow_shows_the_rotation():
     """The element of SO(2) with the angle θ maps (1, 0) to (cos θ, -sin θ)."""
     angles = np.linspace(-3, 3, 13)
     group = make_group("SO(2)")
-    arrows, dots = in_plane(group, group.element(th.as_tensor(angles)[None, :, None]))
+    arrows, dots = film_module.in_plane(group, group.element(th.as_tensor(angles)[None, :, None]))
     assert dots is None
     np.testing.assert_allclose(np.arctan2(arrows[0, :, 0, 1], arrows[0, :, 0, 0]), -angles, atol=1e-6)
 
 
 def test_a_dot_shows_the_translation_and_its_arrow_the_rotation():
     group = make_group("SE(2)")
-    arrows, dots = in_plane(group, group.element(th.tensor([[[0.5, 3.0, -4.0]]], dtype=th.float64)))
+    arrows, dots = film_module.in_plane(group, group.element(th.tensor([[[0.5, 3.0, -4.0]]], dtype=th.float64)))
     np.testing.assert_allclose(dots, [[[3, -4]]])
     np.testing.assert_allclose(arrows, rotation(0.5)[:, 0][None, None, None])
 
@@ -102,15 +86,11 @@ def test_every_group_is_drawn_inside_its_panel(name, n_arrows, has_dot, kind):
     Painter([drawn], np.zeros(len(found), int), 2, "").paint(1, np.zeros((4, 4, 3), np.uint8), "step 0")
 
 
-def test_arrows_of_rotations_have_a_fixed_length():
-    _, found = elements("SO(2)")
-    np.testing.assert_allclose(
-        np.linalg.norm(panel("1", make_group("SO(2)"), th.stack([found, found])).arrows, axis=-1), ROOM, rtol=1e-6
-    )
-    _, found = elements("SE(2)")
-    np.testing.assert_allclose(
-        np.linalg.norm(panel("1", make_group("SE(2)"), th.stack([found, found])).arrows, axis=-1), ARROW, rtol=1e-6
-    )
+@pytest.mark.parametrize("name, length", [("SO(2)", ROOM), ("SE(2)", ARROW)])
+def test_arrows_of_rotations_have_a_fixed_length(name, length):
+    group, found = elements(name)
+    arrows = panel("1", group, th.stack([found, found])).arrows
+    np.testing.assert_allclose(np.linalg.norm(arrows, axis=-1), length, rtol=1e-6)
 
 
 def test_a_panel_grows_for_predictions_except_outliers():
@@ -146,7 +126,7 @@ def test_a_ghost_is_the_prediction_made_some_steps_before(make):
     model.exploration_rate = 1.0  # random actions
     film = shoot(model, ChainEnv(8), STEPS, 0, False)
     states = encode(model, film.observations)
-    ghosts = predictions(model, states, film.actions, film.starts, DEPTH)
+    ghosts = film_module.predictions(model, states, film.actions, film.starts, DEPTH)
     assert len(set(film.starts.tolist())) > 2  # several episodes
     for t in range(STEPS):
         if t - film.starts[t] < DEPTH:  # includes the first frames of the video
@@ -177,11 +157,9 @@ def test_a_film_shows_what_happened(make):
 @pytest.mark.parametrize("group", ["SE(2)^2 x SO(3) x T(2)", None])
 def test_files_have_the_frames_and_the_global_generators_are_unchanged(make, group, tmp_path):
     model = make(ChainEnv(8), symmetry_coef=0, policy_kwargs={"group": group, "n_blocks": None})
-    before = get_rng_state(model.action_space)
+    before = encode_plain(get_rng_state(model.action_space))
     paths = record(model, ChainEnv(8), tmp_path / "new" / "v1.5", 11, 3)
-    after = get_rng_state(model.action_space)
-    assert before["python"] == after["python"] and before["action_space"] == after["action_space"]
-    assert th.equal(before["torch"], after["torch"]) and (before["numpy"][1] == after["numpy"][1]).all()
+    assert encode_plain(get_rng_state(model.action_space)) == before
     assert [path.name for path in paths] == ["v1.5.mp4", "v1.5.gif"]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["v1.5.gif", "v1.5.mp4"]
     movie = imageio.get_reader(paths[0])
@@ -250,14 +228,14 @@ def test_several_normalised_environments(make):
 
 def test_observations_as_images():
     stack = np.arange(4, dtype=np.uint8)[None, :, None, None] * np.ones((2, 4, 5, 6), np.uint8)
-    newest = observed_pictures(stack, spaces.Box(0, 255, (4, 5, 6), np.uint8), 4)
+    newest = film_module.observed_pictures(stack, spaces.Box(0, 255, (4, 5, 6), np.uint8), 4)
     assert len(newest) == 2 and newest[0].shape == (5, 6, 3) and (newest[0] == 3).all()
     planes = np.zeros((1, 4, 5, 6), np.uint8)
     planes[0, 1, 2, 3] = 255
-    (picture,) = observed_pictures(planes, spaces.Box(0, 255, (4, 5, 6), np.uint8), 1)
+    (picture,) = film_module.observed_pictures(planes, spaces.Box(0, 255, (4, 5, 6), np.uint8), 1)
     assert picture[2, 3].max() == 255 and len(set(picture[2, 3].tolist())) > 1 and picture.sum() == picture[2, 3].sum()
     space = spaces.Dict({"a": spaces.Box(-1, 1, (3,)), "b": spaces.Box(-1, 1, (20,))})
-    (picture,) = observed_pictures({"a": np.ones((1, 3)), "b": np.ones((1, 20))}, space, 1)
+    (picture,) = film_module.observed_pictures({"a": np.ones((1, 3)), "b": np.ones((1, 20))}, space, 1)
     assert picture.ndim == 3
 
 
@@ -288,8 +266,6 @@ def test_invalid_arguments_raise(make, tmp_path):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
     with pytest.raises(ValueError, match="env must have the agent's observation_space"):
         record(model, ImageEnv(), tmp_path / "v")
-    with pytest.raises(ValueError, match=r"record needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which"):
-        record(DQN("MlpPolicy", ChainEnv()), ChainEnv(), tmp_path / "v")
 
 
 def test_a_frame_shows_truth_and_ghost():
@@ -314,7 +290,7 @@ def test_a_frame_shows_truth_and_ghost():
 def test_a_block_beyond_its_panel_is_a_triangle_at_the_edge():
     beyond = Panel("1", "dot", None, np.array([[[0.0, 0.0]], [[30.0, 0.0]]]), 1.0)
     painter = Painter([beyond], np.zeros(1, int), 1, "")
-    (shown,) = moved(beyond, 1, 0, painter.artists[0][1])
+    (shown,) = film_module.moved(beyond, 1, 0, painter.artists[0][1])
     assert np.allclose(shown.get_xydata(), [[0.95, 0.0]]) and shown.get_marker() == (3, 0, -90)
     assert "beyond the edge" in [text.get_text() for text in painter.figure.legends[0].get_texts()]
 
@@ -344,20 +320,6 @@ def test_the_callback_does_not_change_training_and_logs_to_tensorboard(make, tmp
 
 
 @EITHER
-def test_the_callback_does_not_change_the_networks(make):
-    callback = LatentCallback(log_freq=1000, n_windows=16)
-    model = trained(make, callback)
-    model.policy.set_training_mode(True)
-    modes = [module.training for module in model.policy.modules()]
-    before, rng = {k: v.clone() for k, v in model.policy.state_dict().items()}, get_rng_state(model.action_space)
-    callback._look()
-    assert [module.training for module in model.policy.modules()] == modes
-    assert all(th.equal(v, before[k]) for k, v in model.policy.state_dict().items())
-    after = get_rng_state(model.action_space)
-    assert th.equal(rng["torch"], after["torch"]) and (rng["numpy"][1] == after["numpy"][1]).all()
-
-
-@EITHER
 def test_the_callback_waits_for_a_complete_window(make, tmp_path, monkeypatch):
     looks = []
     monkeypatch.setattr("sb3_eqr.visualize.callback.diagnose", lambda model, play: looks.append(play) or 1 / 0)
@@ -375,11 +337,6 @@ def test_an_agent_without_latent_losses_warns_once(make, off):
     with pytest.warns(UserWarning, match="LatentCallback logs nothing") as told:
         trained(make, LatentCallback(log_freq=10), **off)
     assert len([warning for warning in told if "LatentCallback" in str(warning.message)]) == 1
-
-
-def test_other_agents_raise():
-    with pytest.raises(ValueError, match=r"LatentCallback needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN"):
-        DQN("MlpPolicy", ChainEnv()).learn(1, callback=LatentCallback())
 
 
 def test_spr_is_refused_at_the_start():

@@ -1,5 +1,7 @@
 """Windows of play: the agent's observations with the true states, without side effects."""
 
+import re
+
 import numpy as np
 import pytest
 import torch as th
@@ -9,11 +11,15 @@ from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage
 
 import sb3_eqr.envs
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.common.groups import Group
+from sb3_eqr.common.saving.plain_data import encode as encode_plain
+from sb3_eqr.common.saving.random_state import get_rng_state
 from sb3_eqr.envs import SlidingBall, make_atari100k_env
+from sb3_eqr.visualize.callback import LatentCallback
 from sb3_eqr.visualize.diagnostics import diagnose
+from sb3_eqr.visualize.film import record
 from sb3_eqr.visualize.latents import coordinate_names, coordinates, encode, frame, play
 from sb3_eqr.visualize.pictures import latent_figure
+from tests.tools.test_package import ROOT
 from tests.toys import ChainEnv
 
 sb3_eqr.envs.register()
@@ -54,17 +60,10 @@ def test_the_same_seed_plays_the_same_without_side_effects():
     model = EqRQRDQN("MlpPolicy", ChainEnv(), buffer_size=200, device="cpu", seed=0)
     env = make_vec_env(ChainEnv, 1, seed=0)
     model.exploration_rate = 0.5  # random actions use the generator of the action space
-    th.manual_seed(5)
-    np.random.seed(5)
-    model.action_space.seed(5)
-    expected = [th.rand(3), np.random.rand(3), [model.action_space.sample() for _ in range(9)]]
-    th.manual_seed(5)
-    np.random.seed(5)
-    model.action_space.seed(5)
+    before = encode_plain(get_rng_state(model.action_space))
     one, two = (play(model, env, n_steps=60, depth=2, seed=1).samples for _ in range(2))
     assert th.equal(one.actions, two.actions) and th.equal(one.observations, two.observations)
-    assert th.equal(th.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
-    assert [model.action_space.sample() for _ in range(9)] == expected[2]
+    assert encode_plain(get_rng_state(model.action_space)) == before
 
 
 def test_atari_can_be_rendered_in_colour():
@@ -73,29 +72,12 @@ def test_atari_can_be_rendered_in_colour():
     assert env.render().shape == (210, 160, 3)
 
 
-class Scalings(Group):
-    """A custom group whose elements are not matrices (docs/groups.md)."""
-
-    def __init__(self, n):
-        super().__init__(f"Scalings({n})", num_params=n, element_shape=(n,))
-
-    def element(self, params):
-        return params.exp()
-
-    def compose(self, left, right):
-        return left * right
-
-    def inverse(self, element):
-        return 1 / element
-
-    def identity(self, *batch, dtype=None, device=None):
-        return th.ones(*batch, *self.element_shape, dtype=dtype, device=device)
-
-
 @pytest.mark.parametrize("n_blocks", [2, 8])
 def test_elements_that_are_not_matrices_are_vectors(n_blocks):
-    """Also with as many blocks as numbers in each block."""
-    group = Scalings(2)
+    """The group of docs/groups.md; also with as many blocks as numbers in each block."""
+    page = (ROOT / "docs" / "groups.md").read_text(encoding="utf-8")
+    exec(re.search(r"^from sb3_eqr.common.groups import Group\n.*?(?=^model = )", page, re.M | re.S)[0], names := {"th": th})
+    group = names["Scalings"](2)
     found = th.rand(5, n_blocks, 2, generator=th.Generator().manual_seed(0))
     assert coordinate_names(group) == ["x 0", "x 1"] and th.equal(coordinates(group, found), found - 1)
     matrix, vector = frame(group, found)
@@ -109,7 +91,7 @@ def test_elements_that_are_not_matrices_are_vectors(n_blocks):
     np.testing.assert_allclose(offsets, states[:, :2].numpy())
 
 
-def test_other_agents_raise():
+def test_other_agents_raise(tmp_path):
     model = DQN("MlpPolicy", "CartPole-v1", device="cpu")
     windows = play(EqRQRDQN("MlpPolicy", "CartPole-v1", device="cpu"), "CartPole-v1", 40, depth=2)  # an id suffices
     message = r"needs an EqR agent \(EqRQRDQN, EqRRainbow\), got DQN, which has no latent model"
@@ -117,6 +99,8 @@ def test_other_agents_raise():
         lambda: play(model, "CartPole-v1"),
         lambda: diagnose(model, windows),
         lambda: encode(model, windows.samples.observations),
+        lambda: record(model, "CartPole-v1", tmp_path / "v"),
+        lambda: model.learn(1, callback=LatentCallback()),
     ):
         with pytest.raises(ValueError, match=message):
             look()

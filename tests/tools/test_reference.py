@@ -54,12 +54,8 @@ def test_reading_runs(tmp_path):
     file.write_text(json.dumps({"pong": [1, 2.5, 3], "bank heist": [4, 5], "Hero": [6]}))
     found = read_runs(file, "X", ["BankHeist", "Pong"])
     assert found.attrs["note"] == "X: the first 2 runs of every game only, as many as all of them have."
-    assert found.to_numpy().tolist() == [
-        ["X", "BankHeist", 0, 4.0],
-        ["X", "BankHeist", 1, 5.0],
-        ["X", "Pong", 0, 1.0],
-        ["X", "Pong", 1, 2.5],
-    ]
+    rows = [["X", "BankHeist", 0, 4.0], ["X", "BankHeist", 1, 5.0], ["X", "Pong", 0, 1.0], ["X", "Pong", 1, 2.5]]
+    assert found.to_numpy().tolist() == rows
 
 
 @pytest.mark.parametrize(

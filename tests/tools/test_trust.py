@@ -4,15 +4,13 @@ import pathlib
 import pickle
 import re
 import shutil
-import sys
 
 import pytest
 import yaml
 from stable_baselines3 import DQN
 
-from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
 from sb3_eqr.trust import check_zoo_folder, is_plain
-from sb3_eqr.zoo.__main__ import main
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs" / "files.md"
 SMALL = {"buffer_size": 500, "learning_starts": 10, "device": "cpu"}
@@ -32,15 +30,6 @@ def ran(call, *args):
     found = pathlib.Path("ran").exists()
     pathlib.Path("ran").unlink(missing_ok=True)
     return found
-
-
-@pytest.fixture
-def command(monkeypatch):
-    def call(line):
-        monkeypatch.setattr(sys, "argv", ["sb3-eqr", *line.split()])
-        main()
-
-    return call
 
 
 @pytest.fixture
@@ -81,35 +70,29 @@ def test_the_table_is_the_one_that_is_tested():
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_commands_that_run_no_code(hostile, command, settings, tmp_path):
+def test_commands_that_run_no_code(hostile, sb3_eqr, settings, tmp_path):
     folder = hostile(**settings)
     model = folder / "CartPole-v1.zip"
     place = f"--algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs"
-    EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(30, checkpoints(folder))
+    EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL).learn(30, ExactCheckpointCallback(20, folder / "checkpoints"))
     lines = [f"train --algo eqr_qrdqn --env CartPole-v1 --resume {folder} -n 60 -f new", f"enjoy {place} -n 5 --no-render"]
     lines += [f"record_video {place} -n 5", f"push_to_hub {place} -orga none --dry-run"]
     if "statistics" in settings:
         lines += [f"train --algo eqr_qrdqn --env CartPole-v1 -i {model} -n 20 -f new -params normalize:True"]
     for line in lines:
-        assert not ran(command, line), line
+        assert not ran(sb3_eqr, line), line
 
 
-def checkpoints(folder):
-    from sb3_eqr import ExactCheckpointCallback
-
-    return ExactCheckpointCallback(20, folder / "checkpoints")
-
-
-def test_commands_that_run_code(hostile, command, tmp_path):
+def test_commands_that_run_code(hostile, sb3_eqr, tmp_path):
     folder = hostile(**SETTINGS[0])
     hostile("dqn", **SETTINGS[3])
     settings = folder / "CartPole-v1" / "config.yml"
     pathlib.Path("file.yml").write_text(yaml.safe_dump({"CartPole-v1": yaml.safe_load(settings.read_text())}))
     place = f"--env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render"
-    assert ran(command, "train --algo eqr_qrdqn --env CartPole-v1 --conf-file file.yml -n 20 -f new")
-    assert ran(command, f"enjoy --algo dqn {place}")
+    assert ran(sb3_eqr, "train --algo eqr_qrdqn --env CartPole-v1 --conf-file file.yml -n 20 -f new")
+    assert ran(sb3_eqr, f"enjoy --algo dqn {place}")
     hostile(**SETTINGS[3])
-    assert ran(command, f"enjoy --algo eqr_qrdqn {place} --trust")
+    assert ran(sb3_eqr, f"enjoy --algo eqr_qrdqn {place} --trust")
 
 
 def test_files_that_run_no_code_without_trust(hostile, tmp_path):
@@ -138,13 +121,13 @@ def test_other_expressions(text):
 
 
 @pytest.mark.parametrize("missing", ["args.yml", "config.yml"])
-def test_one_file_alone_is_checked(hostile, command, missing, tmp_path):
+def test_one_file_alone_is_checked(hostile, sb3_eqr, missing, tmp_path):
     """RL Zoo reads each of them without the other."""
     beside = hostile(**SETTINGS[3]) / "CartPole-v1"
     (beside / missing).unlink()
     if missing == "config.yml":
         (beside / "args.yml").write_text("!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [ran]]")
-    assert not ran(command, f"enjoy --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render")
+    assert not ran(sb3_eqr, f"enjoy --algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}/logs -n 5 --no-render")
 
 
 WRAPPERS = ["sb3_eqr.envs.atari.Atari100kWrapper", "stable_baselines3.common.atari_wrappers.WarpFrame"]

@@ -2,7 +2,6 @@
 
 import functools
 import pickle
-import random
 import re
 import sys
 from collections import OrderedDict
@@ -19,7 +18,9 @@ from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, cli, visualize
+from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, visualize
+from sb3_eqr.common.saving.plain_data import encode as encode_plain
+from sb3_eqr.common.saving.random_state import get_rng_state
 from sb3_eqr.trust import check_zoo_folder
 from sb3_eqr.visualize import loading
 from sb3_eqr.visualize.diagnostics import diagnose
@@ -151,17 +152,13 @@ def test_constant_rewards_and_signs():
     assert np.isnan(diagnose(model, same).rewards.explained).all()
 
 
-def generators():
-    return random.getstate(), pickle.dumps(np.random.get_state()), th.get_rng_state().tolist()
-
-
 def test_the_same_seed_gives_the_same_numbers_without_side_effects(trained):
     windows = play(trained, make_vec_env(Ring), 60, depth=3)
-    state = generators()
+    state = encode_plain(get_rng_state(trained.action_space))
     mode = [module.training for module in trained.policy.modules()]
     first, second = diagnose(trained, windows, seed=3), diagnose(trained, windows, seed=3)
     assert pickle.dumps(first) == pickle.dumps(second)
-    assert generators() == state
+    assert encode_plain(get_rng_state(trained.action_space)) == state
     assert [module.training for module in trained.policy.modules()] == mode
     assert diagnose(trained, windows, seed=4).action_symmetry != first.action_symmetry
 
@@ -195,12 +192,8 @@ def test_every_group(group):
 def test_dict_observations_and_an_agent_without_latent_losses():
     model = make_model(EqRRainbow, "MultiInputPolicy", Ring(keys=True), prediction_depth=0)
     found = look(model, n_steps=60, keys=True)
-    assert (
-        found.verdict == "not trained"
-        and "prediction_depth is 0" in found.summary
-        and not found.rewards_trained
-        and not found.symmetry_trained
-    )
+    assert found.verdict == "not trained" and "prediction_depth is 0" in found.summary
+    assert not found.rewards_trained and not found.symmetry_trained
 
 
 @pytest.mark.parametrize("off", ["reward", "symmetry"])
@@ -228,9 +221,8 @@ def test_plots_share_a_scale_and_have_margins():
 @pytest.mark.parametrize("is_periodic, colours", [(True, "twilight"), (False, "viridis")])
 def test_periodic_factors_have_cyclic_colours(is_periodic, colours):
     model = make_model(group="SE(2)")
-    figure = latent_figure(
-        model, th.randn(9, 12, generator=th.Generator().manual_seed(0)), np.arange(9.0), "angle", is_periodic
-    )
+    states = th.randn(9, 12, generator=th.Generator().manual_seed(0))
+    figure = latent_figure(model, states, np.arange(9.0), "angle", is_periodic)
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
 
 
@@ -241,24 +233,11 @@ def test_many_blocks_and_points_in_one_figure():
     assert len(latent_figure(model, th.zeros(3, 64)).axes) == 13  # all points are equal
 
 
-@pytest.fixture
-def sb3_eqr(monkeypatch, capfd):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["sb3-eqr", "visualize", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as left:
-            return left.code, capfd.readouterr()
-        return 0, capfd.readouterr()
-
-    return call
-
-
 def test_command_line(trained, sb3_eqr, tmp_path):
     pictures = [*PICTURES[:-1], "latents_angle"]  # coloured by the true state
     trained.save(tmp_path / "ring")
-    code, out = sb3_eqr(tmp_path / "ring.zip", "--env", "Ring-v0", "--steps", 200, "--n-envs", 2, "--out", tmp_path / "out")
-    assert code == 0 and out.out.startswith("The latent model predicts: over 3 steps") and str(tmp_path / "out") in out.out
+    shown = sb3_eqr(f"visualize {tmp_path}/ring.zip --env Ring-v0 --steps 200 --n-envs 2 --out {tmp_path}/out").out
+    assert shown.startswith("The latent model predicts: over 3 steps") and str(tmp_path / "out") in shown
     assert {path.name for path in (tmp_path / "out").iterdir()} == {f"{n}.csv" for n in FILES} | {f"{n}.png" for n in pictures}
     tables = {name: pd.read_csv(tmp_path / "out" / f"{name}.csv") for name in FILES}
     assert tables["transition"]["steps_ahead"].tolist() == [1, 2, 3]
@@ -276,21 +255,27 @@ class Pickled(th.nn.ReLU):
 
 def test_an_error_names_the_flag_of_the_command(sb3_eqr, tmp_path):
     make_model(network={"activation_fn": Pickled}).save(tmp_path / "ring")
-    code, out = sb3_eqr(tmp_path / "ring.zip", "--env", "Ring-v0")
-    assert code == 2 and "pass --trust, or pass custom_objects" in out.err
+    shown = sb3_eqr(f"visualize {tmp_path}/ring.zip --env Ring-v0", code=2).err
+    assert "pass --trust, or pass custom_objects" in shown
 
 
-def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "rl_zoo3.import_envs", raising=False)
+@pytest.fixture
+def folder(tmp_path):
+    """The folder that RL Zoo writes beside a model."""
     folder = tmp_path / "Ring-v0_1" / "Ring-v0"
     folder.mkdir(parents=True)
+    (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Ring-v0", env_kwargs=None, gym_packages=[])))
+    (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", normalize=True)))
+    return folder
+
+
+def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
+    monkeypatch.delitem(sys.modules, "rl_zoo3.import_envs", raising=False)
     env = VecNormalize(make_vec_env(functools.partial(Ring, keys=False)))
     model = make_model(env=env)
     model.save(folder.parent / "best_model")
     env.obs_rms.mean[:] = 7
     env.save(folder / "vecnormalize.pkl")
-    (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Ring-v0", env_kwargs=None, gym_packages=[])))
-    (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", normalize=True)))
     path = folder.parent / "best_model.zip"
     loaded = loading.load_model(path, device="cpu")
     assert type(loaded) is EqRQRDQN
@@ -313,11 +298,7 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
         ("args.yml", "env: Ring-v0\ngym_packages: [antigravity]", "got antigravity"),
         ("args.yml", "env: antigravity:Ring-v0", "got antigravity"),
         ("config.yml", "env_wrapper: [{subprocess.run: {}}]", r"got subprocess\.run"),
-        (
-            "config.yml",
-            "env_wrapper: [{stable_baselines3.common.monitor.Monitor: {filename: x}}]",
-            "write no files, got .*Monitor",
-        ),
+        ("config.yml", "env_wrapper: [{stable_baselines3.common.monitor.Monitor: {filename: x}}]", "no files, got .*Monitor"),
         ("config.yml", "env_wrapper: gymnasium.wrappers.RecordVideo", "write no files, got .*RecordVideo"),
         ("config.yml", "normalize: dict(norm_obs=print())", "got normalize: dict"),
         # Functions and classes that the modules of wrappers import, which chained could import any module and write files.
@@ -329,13 +310,9 @@ def test_rl_zoos_files_next_to_the_model_are_used(tmp_path, monkeypatch):
         ("vecnormalize.pkl", pickle.dumps(functools.partial(print)), r"it names functools\.partial"),
     ],
 )
-def test_files_next_to_the_model_are_checked_before_they_are_used(tmp_path, name, content, message):
-    folder = tmp_path / "Ring-v0_1" / "Ring-v0"
-    folder.mkdir(parents=True)
+def test_files_next_to_the_model_are_checked_before_they_are_used(folder, name, content, message):
     model = make_model()
     model.save(folder.parent / "best_model")
-    (folder / "args.yml").write_text("env: Ring-v0")
-    (folder / "config.yml").write_text("policy: MlpPolicy")
     (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(ValueError, match=message):
         loading.make_env(model, folder.parent / "best_model.zip")
@@ -389,22 +366,15 @@ def saved(tmp_path_factory):
     ],
 )
 def test_wrong_use_prints_an_error(line, message, sb3_eqr, saved):
-    code, out = sb3_eqr(*line.format(model=saved / "model.zip", cut=saved / "cut.zip").split())
-    assert code == 2
-    assert re.search(message, out.err.replace("\n", " ")), out.err
+    shown = sb3_eqr("visualize " + line.format(model=saved / "model.zip", cut=saved / "cut.zip"), code=2).err
+    assert re.search(message, shown.replace("\n", " ")), shown
 
 
 def test_kwargs_are_python_or_text():
-    assert loading.parse_kwargs(["a:1", "b:[2, 3]", "c:None", "d:text", "e:a:b"]) == {
-        "a": 1,
-        "b": [2, 3],
-        "c": None,
-        "d": "text",
-        "e": "a:b",
-    }
+    found = loading.parse_kwargs(["a:1", "b:[2, 3]", "c:None", "d:text", "e:a:b"])
+    assert found == {"a": 1, "b": [2, 3], "c": None, "d": "text", "e": "a:b"}
 
 
-def test_public_names():
-    assert visualize.diagnose is diagnose and visualize.play is play
+def test_unknown_names():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         visualize.nothing  # noqa: B018

@@ -209,18 +209,13 @@ def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
     assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
 
 
-def test_agents_with_classes_of_their_own_can_be_played(sb3_eqr, tmp_path, monkeypatch):
-    (tmp_path / "my_trunk.py").write_text(
-        "from stable_baselines3.common.torch_layers import FlattenExtractor\nclass Mine(FlattenExtractor): pass\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
+def test_agents_with_classes_of_their_own_can_be_played(sb3_eqr, own_extractor, tmp_path, monkeypatch):
     monkeypatch.setitem(ALGOS, "eqr_qrdqn", EqRQRDQN)
-    own = "dict(group=None, net_arch=[8], features_extractor_class=__import__('my_trunk').Mine)"
-    (tmp_path / "own.yml").write_text(f'CartPole-v1: {{policy: MlpPolicy, n_timesteps: 60, policy_kwargs: "{own}"}}')
+    (tmp_path / "own.yml").write_text(f'CartPole-v1: {{policy: MlpPolicy, n_timesteps: 60, policy_kwargs: "{own_extractor}"}}')
     files = f"-f {tmp_path} --algo eqr_qrdqn --env CartPole-v1"
     train = f"train {files} --conf-file {tmp_path}/own.yml --eval-freq -1 -params prediction_depth:0"
     sb3_eqr(train)
-    assert re.search(r"my_trunk.*Mine.*pass --trust", sb3_eqr(f"enjoy {files} -n 5 --no-render", code=2).err)
+    assert re.search(r"my_extractor.*Mine.*pass --trust", sb3_eqr(f"enjoy {files} -n 5 --no-render", code=2).err)
     sb3_eqr(f"enjoy {files} -n 5 --no-render --trust")
     sb3_eqr(f"{train} -i {tmp_path}/eqr_qrdqn/CartPole-v1_1/CartPole-v1.zip --trust")
     again = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip", trust=True)

@@ -12,15 +12,8 @@ from sb3_eqr import zoo
 from sb3_eqr.configurations import configuration_files
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
-ENVIRONMENTS = {
-    "atari",
-    "CartPole-v1",
-    "LunarLander-v3",
-    "MountainCar-v0",
-    "Acrobot-v1",
-    "BlindCliffwalk-v0",
-    *(f"MinAtar/{game}-v1" for game in GAMES),
-}
+ENVIRONMENTS = {"atari", "CartPole-v1", "LunarLander-v3", "MountainCar-v0", "Acrobot-v1", "BlindCliffwalk-v0"}
+ENVIRONMENTS |= {f"MinAtar/{game}-v1" for game in GAMES}
 ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
 GENERIC = {"default", "default-image", "default-small-image", "default-dict"}  # test_zoo.py trains by them
 CASES = [  # an entry shared by several environments is one YAML object and built once
@@ -77,8 +70,8 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
         if key in written:
             assert getattr(model, key) == written[key], key
     if "env_wrapper" in written:
-        assert model.observation_space.dtype == "uint8"
-        assert model.observation_space.shape[1:] == ((84, 84) if entry == "atari" else (10, 10))
+        space = model.observation_space
+        assert space.dtype == "uint8" and (space.shape == (4, 84, 84) if entry == "atari" else space.shape[1:] == (10, 10))
     # It can act and be trained, here with a small batch to save time.
     model.learning_starts = 0
     model.train_freq = 24  # the longest n of these files is 20
