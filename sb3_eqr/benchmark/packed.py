@@ -59,6 +59,7 @@ class Entry(Checked):
 class Machine(Checked):
     """What it was trained on."""
 
+    device: str
     threads: PositiveInt
 
 
@@ -74,6 +75,7 @@ class Row(Checked):
     command: str
     started: str
     machine: Machine
+    versions: dict[str, Any]
     attempts: NonNegativeInt
     wall_clock_s: FiniteFloat
     steps_per_second: FiniteFloat

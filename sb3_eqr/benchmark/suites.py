@@ -228,4 +228,5 @@ def write_suite(suite: Suite, path: pathlib.Path) -> None:
 
 
 def read_suite(path: pathlib.Path) -> Suite:
+    """Read a suite; raises ValueError if the file does not hold one."""
     return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))

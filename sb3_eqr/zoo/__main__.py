@@ -218,6 +218,8 @@ def run(command: str, arguments: list[str]) -> None:
             runpy.run_module(module, run_name="__main__")
         else:
             getattr(importlib.import_module(module), command)()
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None  # as after Ctrl-C in a shell; RL Zoo handles it while it trains
     except (*MISTAKES, gym.error.DependencyNotInstalled) as error:
         message = explanation(command, error)
         if message is None:

@@ -458,7 +458,8 @@ def test_tensorboard(make, tmp_path):
 
 def test_progress_bar_and_fake_images(make):
     env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=True)
-    make(env, "CnnPolicy").learn(50, progress_bar=True)
+    model = make(env, "CnnPolicy").learn(50, progress_bar=True)
+    assert model.num_timesteps >= 50 and model._n_updates > 0
 
 
 def test_flags_as_arrays_are_stored(make):

@@ -532,7 +532,8 @@ def test_a_damaged_result_is_named(tmp_path, report_of):
     row = json.loads(path.read_text())
     wrong = []
     for key in row:
-        for value in (None, "text", -1.5, [], [None], {}, {"step": "x"}):
+        parts = [{k: v for k, v in row[key].items() if k != part} for part in row[key]] if isinstance(row[key], dict) else []
+        for value in (None, "text", -1.5, [], [None], {}, {"step": "x"}, *parts):
             path.write_text(json.dumps({**row, key: value}))
             try:
                 write_report([tmp_path / "a"], {}, False, tmp_path / "report", reps=2)

@@ -137,8 +137,9 @@ WRAPPERS += ["rl_zoo3.wrappers.MaskVelocityWrapper", "stable_baselines3.common.v
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 def test_wrappers_of_kept_libraries_are_allowed(wrapper, tmp_path):
-    (tmp_path / "config.yml").write_text(yaml.safe_dump({"env_wrapper": [{wrapper: {}}]}))
-    check_zoo_folder(tmp_path)
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({"env_wrapper": [{wrapper: {}}, "mine.Wrapper"]}))
+    with pytest.raises(ValueError, match=r"that write no files, got mine\.Wrapper\. "):  # the other one alone
+        check_zoo_folder(tmp_path)
 
 
 @pytest.mark.parametrize("wrapper", ["rl_zoo3.wrappers.np", "gymnasium.wrappers.RecordVideo", "rl_zoo3.wrappersx.Mine"])
