@@ -30,7 +30,8 @@ MODULES = {"test_her": HER, "test_n_step_replay": "it expects SB3's own buffer f
 REASONS = {  # tests, without their parameters
     "test_feature_extractor_target_net": COPIED,
     "test_features_extractor_target_net": COPIED,
-    "test_image_like_input": "it expects an AssertionError for float images; ours is a ValueError that says what to pass",
+    "test_image_like_input": "it normalises integer images with VecNormalize, which is refused with a ValueError that says "
+    "what to pass: SB3 would store their terminal observations as other images",
     "test_consistency": "MlpPolicy starts with a dense layer that MultiInputPolicy does not have",
     "test_save_load_replay_buffer": BUFFER,
     "test_offpolicy_collect_rollout_batch_norm": TRUNK,

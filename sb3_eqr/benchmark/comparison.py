@@ -11,6 +11,7 @@ import pandas as pd
 from sb3_eqr.benchmark import selection
 from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import PUBLISHED_STEPS
+from sb3_eqr.benchmark.runs import PLAN, Run, read_plan
 from sb3_eqr.benchmark.scores import final_score, normalised, read_runs
 from sb3_eqr.benchmark.statistics import METRICS
 from sb3_eqr.benchmark.suites import RAW, Suite, nearest_name
@@ -113,6 +114,9 @@ def compare(
     used.sort(key=lambda row: (agents.index(row["agent"]), games.index(row["game"]), row["seed"]))
     if stopped := sum(len(rows) - len(finished[folder]) for folder, (_, rows) in found.items()):
         notes.append(f"{stopped} runs were stopped before their end and are left out.")
+    unfinished = [run.label for folder, (_, rows) in found.items() for run in _unfinished(folder, rows)]
+    if unfinished:
+        notes.append(f"Left out, because they have not finished: {'; '.join(unfinished)}.")
     notes += [*selection.never_learn(used), *selection.settings_differences(used)]
     differing = selection.protocol_differences(used)
     if differing and not force:
@@ -171,6 +175,13 @@ def _select(finished: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[
             raise ValueError(f"{folder}: {name} must have a final evaluation, got none.")
         where[run] = folder
     return [row for _, row in kept]
+
+
+def _unfinished(folder: pathlib.Path, rows: list[dict[str, Any]]) -> list[Run]:
+    """:return: the planned runs of a benchmark's folder that have no row; none for a file"""
+    there = {(row["agent"], row["game"], row["seed"]) for row in rows}
+    planned = read_plan(folder) if any(folder.glob(f"runs/*/*/*/{PLAN}")) else []
+    return [run for run in planned if (run.agent.name, run.game, run.seed) not in there]
 
 
 def _bounds(suites: list[Suite], results: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:

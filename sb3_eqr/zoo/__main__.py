@@ -24,7 +24,7 @@ from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.checks import check_device, check_environment, check_loggers, check_trained_agent, fail, failing
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 from sb3_eqr.zoo.registration import trust_files
-from sb3_eqr.zoo.resuming import ResumableExperiment, checkpoints_of, config_of
+from sb3_eqr.zoo.resuming import FOLDER, ResumableExperiment, checkpoints_of, config_of
 
 # Each command is a module of RL Zoo with a function of the same name, or a script.
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
@@ -153,7 +153,11 @@ def prepare_resuming(args: argparse.Namespace) -> list[str]:
             _, manifest = read_manifest(checkpoints_of(args.resume))
         seed = manifest["settings"].get("seed")
     train.ExperimentManager = partial(  # type: ignore[misc, assignment]
-        ResumableExperiment, checkpoint_every=args.checkpoint_every, resume=args.resume, trust=args.trust
+        ResumableExperiment,
+        checkpoint_every=args.checkpoint_every,
+        resume=args.resume,
+        trust=args.trust,
+        conf_file=args.conf_file,
     )
     return [] if seed is None else ["--seed", str(seed)]  # RL Zoo shows and stores it, and would draw one
 
@@ -181,7 +185,11 @@ def check_trained(args: argparse.Namespace) -> None:
         runs = pathlib.Path(args.folder, algo).glob(f"{name}_*/*.zip")
         places = {run.parent.name.rpartition("_")[2]: run for run in runs}
         ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
-        if ids:
+        unfinished = sorted(pathlib.Path(args.folder, algo).glob(f"{name}_*/{FOLDER}"))
+        if unfinished and not places:
+            run = unfinished[-1].parent
+            found = f"{run} was interrupted: sb3-eqr train --algo {algo} --env {args.env} -f {args.folder} --resume {run}"
+        elif ids:
             found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."
         elif places:
             found = f"Runs with -uuid have no number: give the file to sb3-eqr visualize, as in {next(iter(places.values()))}."

@@ -5,6 +5,7 @@ import pathlib
 import shutil
 import signal
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -43,10 +44,20 @@ class ResumableExperiment(ExperimentManager):
     :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
     :param resume: a run's folder, or a folder of checkpoints; ``None``: a new run
     :param trust: as in ``load``
+    :param conf_file: the file that the user named, which args.yml keeps; a temporary one may be used in its place
     """
 
-    def __init__(self, *args: Any, checkpoint_every: int | None, resume: pathlib.Path | None, trust: bool, **kwargs: Any):
+    def __init__(
+        self,
+        *args: Any,
+        checkpoint_every: int | None,
+        resume: pathlib.Path | None,
+        trust: bool,
+        conf_file: str | None,
+        **kwargs: Any,
+    ):
         super().__init__(*args, **kwargs)
+        self.args.conf_file = conf_file
         self.checkpoint_every, self.resume, self.trust = checkpoint_every, resume, trust
         self.best: tuple[float, dict[str, Any]] = (-math.inf, {})  # value and parameters of a search's best trial
         self.continue_training = self.continue_training or resume is not None
@@ -85,9 +96,13 @@ class ResumableExperiment(ExperimentManager):
             super().hyperparameters_optimization()
         finally:
             self._remove_folder()
-        if self.algo in AGENTS and self.best[1]:
+        best = self.best[1]
+        if self.storage and self.study_name:
+            with suppress(ValueError):  # no trial has finished
+                best = self.load_trial(self.storage, self.study_name, convert=False)  # also of earlier commands
+        if self.algo in AGENTS and best:
             env_id = self.env_name.gym_id
-            found = {**read_entry(str(self.config), env_id, {}), **HYPERPARAMS_CONVERTER[self.algo](self.best[1])}
+            found = {**read_entry(str(self.config), env_id, {}), **HYPERPARAMS_CONVERTER[self.algo](best)}
             print(f"As a file for --conf-file:\n{yaml.safe_dump({env_id: found})}")
 
     def create_callbacks(self) -> None:
@@ -148,5 +163,6 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
             if not (config.parent / "args.yml").is_file():
                 raise ValueError(f"{config.parent} must have args.yml beside config.yml, as RL Zoo writes it, got none.")
             entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
-            return {**entry, **({"env_kwargs": kwargs} if (kwargs := arguments.get("env_kwargs")) else {})}
+            given = {name: arguments.get(name) for name in ("env_kwargs", "n_timesteps")}
+            return {**entry, **{name: value for name, value in given.items() if value not in (None, {}, -1)}}
     return None

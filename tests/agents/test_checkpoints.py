@@ -101,8 +101,10 @@ def test_an_environment_of_an_unknown_class_is_resumed_with_new_episodes(tmp_pat
     def make_env():
         return VecNormalize(make_vec_env(lambda: SampledEnv(spaces.Box(-1, 1, (3,), np.float32))))
 
-    EqRQRDQN("MlpPolicy", make_env(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
-    with pytest.warns(UserWarning, match=r"the state of .*SampledEnv is not known.*state_dict and load_state_dict") as caught:
+    message = r"The state of .*SampledEnv is not known.*state_dict and load_state_dict"
+    with pytest.warns(UserWarning, match=message):  # when there is still time
+        EqRQRDQN("MlpPolicy", make_env(), **SMALL).learn(60, ExactCheckpointCallback(45, tmp_path))
+    with pytest.warns(UserWarning, match=message) as caught:
         model = EqRQRDQN.resume(tmp_path, make_env())
     assert sum("is not known" in str(warning.message) for warning in caught) == 1
     assert model._last_obs is None and model.get_vec_normalize_env().obs_rms.count > 45  # the statistics are not lost

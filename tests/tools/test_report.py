@@ -253,6 +253,16 @@ def test_a_different_protocol_raises_or_is_marked(tmp_path, report_of):
     assert set(rows["agent"]) == {BASE} and rows["protocol_differs"].str.startswith("steps is 50000").all()
 
 
+def test_an_agent_without_a_finished_run_is_named(tmp_path, report_of):
+    scores = {agent: {"Pong": SCORES[agent]["Pong"]} for agent in (BASE, FULL)}
+    folder = a_benchmark(tmp_path / "b", scores, a_suite(games=["Pong"]))
+    plan = a_result("sac", "Pong", 4, 0, SUITE)
+    (folder / "runs/sac/Pong/4").mkdir(parents=True)
+    (folder / "runs/sac/Pong/4/run.json").write_text(json.dumps(plan))
+    page = write_report([folder], {}, False, tmp_path / "report", reps=5)
+    assert "Left out, because they have not finished: sac, Pong, seed 4." in text_of(page)
+
+
 def test_missing_runs_are_omitted_and_reported(tmp_path, report_of):
     def change(result):
         run = (result["agent"], result["game"], result["seed"])

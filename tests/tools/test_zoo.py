@@ -207,6 +207,19 @@ def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
     assert (model.n_envs, model.gradient_steps, model.gamma) == (2, 1, 0.9) and model.num_timesteps >= 400
     settings = read_plain(resumed / "CartPole-v1" / "config.yml")
     assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
+    assert read_plain(resumed / "CartPole-v1" / "args.yml")["conf_file"] is None  # it was resumed by a temporary file
+
+
+def test_a_killed_run_is_named_by_enjoy_and_resumed_to_its_own_end(sb3_eqr, tmp_path):
+    files = f"--algo eqr_qrdqn --env CartPole-v1 -f {tmp_path}"
+    few_updates = "-params learning_starts:20 train_freq:4 gradient_steps:1"
+    sb3_eqr(f"train {files} -n 240 --eval-freq -1 --checkpoint-every 100 {few_updates}")
+    run = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
+    (run / "CartPole-v1.zip").unlink()  # as if it was killed
+    line = f"sb3-eqr train {files} --resume {run}"
+    assert line in sb3_eqr(f"enjoy {files} --no-render", code=2).err
+    sb3_eqr(line.removeprefix("sb3-eqr "))
+    assert EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip").num_timesteps == 240
 
 
 def test_agents_with_classes_of_their_own_can_be_played(sb3_eqr, own_extractor, tmp_path, monkeypatch):
@@ -419,13 +432,16 @@ def test_environments_can_be_rendered(env_id):
 def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     """The search keeps the entry's small encoder, because Atari's has filters larger than these images."""
     line = "train --algo eqr_rainbow --env MinAtar/Breakout-v1 -n 30 --seed 1 -params learning_starts:25 buffer_size:100"
-    shown = sb3_eqr(f"{line} -optimize --n-trials 1 --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}")
+    line += f" -optimize --n-evaluations 1 --eval-episodes 1 --no-optim-plots -f {tmp_path}"
+    shown = sb3_eqr(f"{line} --max-total-trials 1 --study-name a --storage sqlite:///{tmp_path}/a.db")
     assert "Number of finished trials:  1" in shown.out
     entry = yaml.safe_load(shown.out.partition("As a file for --conf-file:")[2])["MinAtar/Breakout-v1"]
     assert entry["policy"] == "CnnPolicy" and "n_timesteps" in entry  # also what was not searched
     layers = {"features_extractor_kwargs": {"layers": [[16, 3, 1]]}}
     assert entry["policy_kwargs"].items() >= layers.items() and {"gamma", "gradient_steps"} <= entry.keys()
     assert [path.suffix for path in (tmp_path / "eqr_rainbow").iterdir() if path.is_dir()] == []  # no run to play
+    again = sb3_eqr(f"{line} --max-total-trials 1 --study-name a --storage sqlite:///{tmp_path}/a.db")  # has finished
+    assert yaml.safe_load(again.out.partition("As a file for --conf-file:")[2])["MinAtar/Breakout-v1"] == entry
 
 
 def test_minatar_is_deterministic_with_a_seed():

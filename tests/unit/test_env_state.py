@@ -196,6 +196,16 @@ def test_state_dict_must_be_plain():
         capture(make_vec_env(lambda: env, 1))
 
 
+def test_a_mistake_in_load_state_dict_is_not_blamed_on_the_checkpoint():
+    env = ChainEnv()
+    env.state_dict, env.load_state_dict = dict, lambda state: state["position"]
+    envs = make_vec_env(lambda: env, 1)
+    with pytest.raises(
+        ValueError, match=r"ChainEnv\.load_state_dict must load what its state_dict returned, got KeyError\('position'"
+    ):
+        restore(envs, capture(envs)[0], wrappers_only=False)
+
+
 def test_the_table_names_only_known_types():
     kinds = {kind for row in ATTRIBUTES.values() for entry in row.values() for kind in entry.removesuffix("?").split("/")}
     assert kinds == {"int", "real", "bool", "array", "list", "tuple", "part"}

@@ -144,6 +144,15 @@ def read_manifest(path: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]]:
     return found, manifest
 
 
+def warn_of_unknown(classes: list[str]) -> None:
+    """Warn, at the start of a run and when it is resumed, that its environments' state is not stored."""
+    warnings.warn(
+        f"The state of {', '.join(classes[:3])} is not known, so training resumes with new episodes, and does not continue "
+        "bit for bit. Give the class state_dict and load_state_dict; in other processes, make the environments with "
+        "wrapper_class=sb3_eqr.envs.ResumableWrapper."
+    )
+
+
 def restore_run(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) -> None:
     """
     Restore the state of the environments and of the random generators. If that of the environments is not known completely,
@@ -204,6 +213,10 @@ class ExactCheckpointCallback(BaseCallback):
                 "ExactCheckpointCallback: the agent must be one of this package, which can resume, got "
                 f"{type(self.model).__name__}. Use SB3's CheckpointCallback."
             )
+        env = self.model.get_env()
+        assert env is not None
+        if unknown := capture(env)[1]:
+            warn_of_unknown(unknown)
         old = find_checkpoints(self.save_path)
         manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)

@@ -233,9 +233,17 @@ def _restore(part: Any, state: Any) -> None:
     elif (row := _row(part)) is None:
         if state["np_random"] is not None:
             _restore(part.np_random, state["np_random"])
-        part.load_state_dict(decode(state["state"]))
+        _load_own(part, decode(state["state"]))
     else:
         _restore_attributes(part, state, row)
+
+
+def _load_own(part: Any, state: Any) -> None:
+    """The ``load_state_dict`` of a user's class, whose mistakes are not the checkpoint's."""
+    try:
+        part.load_state_dict(state)
+    except Exception as error:
+        raise ValueError(f"{_name(part)}.load_state_dict must load what its state_dict returned, got {error!r}.") from error
 
 
 def _restore_attributes(part: Any, state: dict[str, Any], row: dict[str, str]) -> None:

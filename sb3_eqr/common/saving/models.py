@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_eqr.common.checks.validation import check_names
 from sb3_eqr.common.saving.buffers import read_buffer, write_buffer
-from sb3_eqr.common.saving.checkpoints import BUFFER, MODEL, read_manifest, restore_run
+from sb3_eqr.common.saving.checkpoints import BUFFER, MODEL, read_manifest, restore_run, warn_of_unknown
 from sb3_eqr.common.saving.files import atomic_write, is_unbroken, seal, stored_members
 from sb3_eqr.common.saving.plain_data import UntrustedError, decode, encode
 from sb3_eqr.common.saving.random_state import get_rng_state, set_rng_state
@@ -231,11 +231,7 @@ class SafeFiles(OffPolicyAlgorithm):
             model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
         restore_run(model, manifest, is_exact)
         if not is_exact:
-            warnings.warn(
-                f"{checkpoint}: the state of {', '.join(manifest['unknown'][:3])} is not known, so training resumes with new "
-                "episodes, and does not continue bit for bit. Give the class state_dict and load_state_dict; in other "
-                "processes, make the environments with wrapper_class=sb3_eqr.envs.ResumableWrapper."
-            )
+            warn_of_unknown(manifest["unknown"])
         return model
 
     def save_replay_buffer(self, path: FileOrPath) -> None:
