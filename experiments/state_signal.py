@@ -52,8 +52,9 @@ def signal(model: EqRRainbow, observations: np.ndarray) -> dict[str, float]:
     policy.set_training_mode(False)
     features = policy.online.features(policy.obs_to_tensor(observations)[0])  # (N, F)
     state = policy.latent_model.embedding(features)
-    logits = policy.online.head(features)  # (N, atoms, A)
-    draws = th.stack([policy.online.head(features[:1], noisy=True)[0] for _ in range(N_DRAWS)])
+    head = policy.online.head
+    logits = head(features)  # (N, atoms, A)
+    draws = th.stack([head(features[:1], head.draw_noise())[0] for _ in range(N_DRAWS)])
     return {
         "constant": state.mean(dim=0).norm().item(),
         "spread": state.var(dim=0, correction=0).sum().sqrt().item(),

@@ -102,25 +102,22 @@ class Objective:
 
     def td_loss(self, samples: SequenceReplayBufferSamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
-        online, target, n_samples = self.policy.online, self.policy.target, len(features)
+        online, target = self.policy.online, self.policy.target
         with th.no_grad():
             next_observations = self.augment(samples.next_observations)
             next_features = self.target_encoder(next_observations)
-            inputs = [features]
+            noise = online.head.draw_noise()  # one draw for both uses
+            next_outputs = target.head(next_features, target.head.draw_noise())  # (B, N, A)
+            chooser, outputs = target, next_outputs
             if self.double_q:
                 is_same = self.target_encoder is self.encoder
-                inputs.append(next_features if is_same else self.encoder(next_observations))
-        # One pass of the online head, with one draw of noise, for both uses.
-        outputs = online.head(th.cat(inputs), noisy=True)  # (B or 2 B, N, A)
-        with th.no_grad():
-            next_outputs = target.head(next_features, noisy=True)  # (B, N, A)
-            values = online.expectation(outputs.detach())  # (B or 2 B, A)
-            next_values = values[n_samples:] if self.double_q else target.expectation(next_outputs)
-            next_best = of_actions(next_outputs, next_values.argmax(dim=1, keepdim=True))  # (B, N)
+                chooser, outputs = online, online.head(next_features if is_same else self.encoder(next_observations), noise)
+            next_best = of_actions(next_outputs, chooser.expectation(outputs).argmax(dim=1, keepdim=True))  # (B, N)
             discounts = th.addcmul(samples.discounts, samples.discounts, samples.dones, value=-1)  # (B, 1): 0 at the end
-        current = of_actions(outputs[:n_samples], samples.actions)  # (B, N)
+        current = of_actions(online.head(features, noise), samples.actions)  # (B, N)
         loss, priorities = online.td_loss(current, next_best, samples.rewards, discounts)
-        return loss, priorities, values.gather(1, samples.actions).squeeze(dim=1)
+        with th.no_grad():
+            return loss, priorities, online.expectation(current)
 
     def latent_losses(
         self, names: list[str], samples: SequenceReplayBufferSamples, observations: PyTorchObs, features: th.Tensor

@@ -24,7 +24,7 @@ class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
         :param noisy: whether to draw noise in noisy layers
         :return: quantiles, (B, n_quantiles, n_actions)
         """
-        return self.head(self.features(obs), noisy)
+        return self.head(self.features(obs), self.head.draw_noise() if noisy else None)
 
     @property
     def n_quantiles(self) -> int:  # type: ignore[override]

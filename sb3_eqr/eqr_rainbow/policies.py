@@ -38,7 +38,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         :param noisy: whether to draw noise in noisy layers
         :return: Q values, (B, n_actions)
         """
-        return self.expectation(self.head(self.features(obs), noisy))
+        return self.expectation(self.head(self.features(obs), self.head.draw_noise() if noisy else None))
 
     def log_probs(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
         """
@@ -46,7 +46,7 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         :param noisy: whether to draw noise in noisy layers
         :return: log-probabilities of the returns in ``support``, (B, n_atoms, n_actions)
         """
-        return self.head(self.features(obs), noisy).log_softmax(dim=1)
+        return self.head(self.features(obs), self.head.draw_noise() if noisy else None).log_softmax(dim=1)
 
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         support = self.support.view(-1, *[1] * (outputs.ndim - 2))  # (N, 1) or (N,)

@@ -26,7 +26,7 @@ def test_noisy_layer_by_its_formula(batch):
 def test_noise_does_not_depend_on_train_mode():
     head = DistributionalHead(4, 2, 3, [8], nn.ReLU, dueling=True, sigma_init=0.5).eval()
     inputs = th.randn(2, 4)
-    assert not th.equal(head(inputs, noisy=True), head(inputs, noisy=True))
+    assert not th.equal(head(inputs, head.draw_noise()), head(inputs, head.draw_noise()))
     head.train()
     assert th.equal(head(inputs), head(inputs))
 

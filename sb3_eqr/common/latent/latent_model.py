@@ -13,6 +13,7 @@ from typing import TypeVar
 
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_eqr.common.groups import Group
 from sb3_eqr.common.latent.options import LatentOptions
@@ -166,7 +167,11 @@ class LatentModel(nn.Module):
 
     def project(self, state: th.Tensor) -> th.Tensor:
         """p, followed by the predictor: (N, D) to (N, P)."""
-        return self.predictor(self.projection(state))
+        first, second = self.projection, self.predictor
+        if isinstance(first, nn.Linear) and isinstance(second, nn.Linear) and len(state) > self.state_dim:
+            weight = second.weight @ first.weight  # one product for all states in place of two
+            return F.linear(state, weight, F.linear(first.bias, second.weight, second.bias))
+        return second(first(state))
 
     def symmetry_loss(
         self,

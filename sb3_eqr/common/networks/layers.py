@@ -139,19 +139,23 @@ class DistributionalHead(nn.Module):
         modules = [self.first, *streams]
         self._noisy_layers = [layer for module in modules for layer in module if isinstance(layer, NoisyLinear)]
 
-    def forward(self, features: th.Tensor, noisy: bool = False) -> th.Tensor:
+    def draw_noise(self) -> list[Noise] | None:
+        """Draw noise for all layers, which calls of :meth:`forward` may share; ``None`` without noisy layers."""
+        return draw_noise(self._noisy_layers) if self._noisy_layers else None
+
+    def forward(self, features: th.Tensor, noise: Sequence[Noise] | None = None) -> th.Tensor:
         """
         :param features: (B, D)
-        :param noisy: whether to draw noise for the noisy layers; all samples share one draw
+        :param noise: from :meth:`draw_noise`, the same for all samples; ``None``: use the mean weights
         :return: (B, N, A)
         """
-        noise = iter(draw_noise(self._noisy_layers)) if noisy and self._noisy_layers else None
-        hidden = self.activation(self.first(features, noise)) if len(self.first) else features
+        left = None if noise is None else iter(noise)  # for the layers to come
+        hidden = self.activation(self.first(features, left)) if len(self.first) else features
         if self.value is None:
-            return self.advantage(hidden, noise).view(-1, self.n_atoms, self.n_actions)
+            return self.advantage(hidden, left).view(-1, self.n_atoms, self.n_actions)
         of_advantage, of_value = hidden.chunk(2, dim=1) if len(self.first) else (hidden, hidden)
-        advantage = self.advantage(of_advantage, noise).view(-1, self.n_atoms, self.n_actions)
-        value = self.value(of_value, noise)[:, :, None]  # (B, N, 1)
+        advantage = self.advantage(of_advantage, left).view(-1, self.n_atoms, self.n_actions)
+        value = self.value(of_value, left)[:, :, None]  # (B, N, 1)
         return value + advantage - advantage.mean(dim=2, keepdim=True)
 
     @th.no_grad()

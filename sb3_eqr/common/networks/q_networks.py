@@ -63,7 +63,7 @@ class EqRNetwork(BasePolicy):
         """
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = True) -> th.Tensor:
-        outputs = self.head(self.features(observation), noisy=not deterministic)
+        outputs = self.head(self.features(observation), None if deterministic else self.head.draw_noise())
         return self.expectation(outputs).argmax(dim=1)  # (B,)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
