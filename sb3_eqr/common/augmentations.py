@@ -54,17 +54,17 @@ def _unpacked(words: th.Tensor, channels: int) -> th.Tensor:
     return pixels.permute(0, 3, 1, 2)[:, :channels]
 
 
-def random_intensity(images: th.Tensor, scale: float, unit: float = 1.0) -> th.Tensor:
+def random_intensity(images: th.Tensor, scale: float, unit: float = 1.0, dtype: th.dtype = th.float32) -> th.Tensor:
     """
     Multiply each image by 1 + scale · clip(ε, −2, 2), ε ~ N(0, 1) (Schwarzer et al. 2021, https://arxiv.org/abs/2007.05929).
 
     :param images: (B, C, H, W), uint8 or floating point
     :param scale: ≥ 0; Table 5 uses 0.05
     :param unit: additional constant factor; 1/255 maps bytes to [0, 1]
-    :return: same shape, float32 (or the images' own floating dtype), not clipped, channels-last
+    :param dtype: of the result
+    :return: same shape, not clipped, channels-last
     """
     noise = th.randn(images.shape[0], 1, 1, 1, device=images.device).clamp_(-2.0, 2.0)
-    dtype = images.dtype if images.is_floating_point() else th.float32
     # Convert to floats in the layout of the convolutions in one pass, so that they need not copy the images again.
     images = images.to(dtype, memory_format=th.channels_last, copy=True)
-    return images.mul_(unit * (1.0 + scale * noise))
+    return images.mul_((unit * (1.0 + scale * noise)).to(dtype))

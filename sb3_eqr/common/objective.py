@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from torch import nn
 
 from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.latent.gradients import branch
@@ -52,6 +53,7 @@ class Objective:
         gradient's norm; ``None``: no cap
     :param target_is_copied: whether the target network is a copy of the online one before each update. Then its encoder is the
         online one, unless that computes something else in train mode
+    :param bfloat16_targets: whether encoders compute in bfloat16 where no gradient flows
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Objective:
         intensity_scale: float,
         aux_gradient_share: float | None = None,
         target_is_copied: bool = False,
+        bfloat16_targets: bool = False,
     ):
         self.policy = policy
         self.double_q = double_q
@@ -74,6 +77,7 @@ class Objective:
         self.target_encoder = self.encoder if is_online else policy.target.features_extractor
         of_latent = self.target_encoder if policy.options.latent_tau is None else self.encoder
         self.latent_encoder = policy.latent_encoder or of_latent
+        self.target_dtype = th.bfloat16 if bfloat16_targets else th.float32
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: Mapping[str, float]) -> LossTerms:
         """
@@ -104,17 +108,18 @@ class Objective:
         """Distributional Q-learning on the n-step transition: TD loss, new priorities and Q(s_t, a_t), (B,) each."""
         online, target = self.policy.online, self.policy.target
         with th.no_grad():
-            next_observations = self.augment(samples.next_observations)
-            next_features = self.target_encoder(next_observations)
-            noise = online.head.draw_noise()  # one draw for both uses
+            next_observations = self.augment(samples.next_observations, self.target_dtype)
+            next_features = self.encode(self.target_encoder, next_observations)
+            is_same = self.target_encoder is self.encoder or not self.double_q
+            for_choice = next_features if is_same else self.encode(self.encoder, next_observations)
+            noise = online.head.draw_noise()
+        weights = online.head.with_noise(noise)  # one draw for both uses
+        with th.no_grad():
             next_outputs = target.head(next_features, target.head.draw_noise())  # (B, N, A)
-            chooser, outputs = target, next_outputs
-            if self.double_q:
-                is_same = self.target_encoder is self.encoder
-                chooser, outputs = online, online.head(next_features if is_same else self.encoder(next_observations), noise)
+            chooser, outputs = (online, online.head(for_choice, weights)) if self.double_q else (target, next_outputs)
             next_best = of_actions(next_outputs, chooser.expectation(outputs).argmax(dim=1, keepdim=True))  # (B, N)
             discounts = th.addcmul(samples.discounts, samples.discounts, samples.dones, value=-1)  # (B, 1): 0 at the end
-        current = of_actions(online.head(features, noise), samples.actions)  # (B, N)
+        current = of_actions(online.head(features, weights), samples.actions)  # (B, N)
         loss, priorities = online.td_loss(current, next_best, samples.rewards, discounts)
         with th.no_grad():
             return loss, priorities, online.expectation(current)
@@ -128,13 +133,22 @@ class Objective:
         latent_model, target_features, target_rollout = self.policy.latent_model, None, None
         with th.no_grad():
             if latent_model.NEED_FEATURES.intersection(names):
-                target_features = features if self.latent_encoder is self.encoder else self.latent_encoder(observations)
+                is_same = self.latent_encoder is self.encoder
+                target_features = features if is_same else self.encode(self.latent_encoder, observations)
             if latent_model.NEED_ROLLOUT.intersection(names):
-                target_rollout = self.latent_encoder(self.augment(flat(rollout)))  # (B * M, F)
+                augmented = self.augment(flat(rollout), self.target_dtype)
+                target_rollout = self.encode(self.latent_encoder, augmented)  # (B * M, F)
         # After the end of an episode, action 0: what follows must not leak through batch statistics.
         actions = self.policy.embed_actions(samples.rollout_actions * mask.long())  # (B, M, A)
         target = self.policy.latent_target
         return latent_model(names, features, actions, rewards, mask, target, target_features, target_rollout)
+
+    def encode(self, encoder: nn.Module, observations: PyTorchObs) -> th.Tensor:
+        """Features without gradient, (B, F), of augmented observations, (B, *obs_shape)."""
+        if self.target_dtype == th.float32:
+            return encoder(observations)
+        with th.autocast(self.policy.device.type, self.target_dtype, cache_enabled=False):
+            return encoder(observations).float()
 
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -165,21 +179,23 @@ class Augmentation:
         self.shifts = {key: min(shift_pixels, side // self.SIDE_PER_PIXEL) for key, side in sides.items()}
         self.intensity_scale = intensity_scale
 
-    def __call__(self, observations: PyTorchObs) -> PyTorchObs:
-        """Map observations, (B, *obs_shape) or a dict of these, to floats for a features extractor."""
+    def __call__(self, observations: PyTorchObs, dtype: th.dtype = th.float32) -> PyTorchObs:
+        """
+        Map observations, (B, *obs_shape) or a dict of these, to floats for a features extractor; ``dtype`` is that of images.
+        """
         if isinstance(observations, dict):
-            return {key: self._part(key, obs) for key, obs in observations.items()}
-        return self._part("", observations)
+            return {key: self._part(key, obs, dtype) for key, obs in observations.items()}
+        return self._part("", observations, dtype)
 
-    def _part(self, key: str, observations: th.Tensor) -> th.Tensor:
+    def _part(self, key: str, observations: th.Tensor, dtype: th.dtype) -> th.Tensor:
         if key in self.image_keys:
             if self.shifts[key] > 0:
                 observations = random_shift(observations, self.shifts[key])
             if self.intensity_scale > 0:  # in one pass with the division of preprocess_obs: this is the largest tensor
                 unit = 1 / 255 if self._normalize_images else 1.0
-                return random_intensity(observations, self.intensity_scale, unit).float()
+                return random_intensity(observations, self.intensity_scale, unit, dtype)
             if self._normalize_images:
-                return observations / 255  # as preprocess_obs, in one pass
+                return observations.to(dtype) / 255  # as preprocess_obs, in one pass
         return preprocess_obs(observations, self._spaces[key], self._normalize_images)  # type: ignore[return-value]
 
 

@@ -244,6 +244,41 @@ def test_one_features_pass_is_used_for_all_losses(make, monkeypatch, network, en
     assert calls == [(online, 8), (encoder, 8), *([(online, 8)] if encoder is target else []), (encoder, 8 * 2)]
 
 
+@pytest.mark.parametrize("policy, env", [("CnnPolicy", ImageEnv), ("MultiInputPolicy", SimpleMultiObsEnv)])
+def test_bfloat16_only_where_no_gradient_flows(make, monkeypatch, policy, env):
+    """The online pass and its gradients stay as they are; the other passes have bfloat16's precision of 2⁻⁸."""
+    seen, conv2d = [], th.nn.Conv2d.forward
+
+    def watched(self, images):
+        seen.append((th.is_grad_enabled(), (found := conv2d(self, images)).dtype))
+        return found
+
+    model = make(env(), policy, double_q=True, tau=0.5).learn(44)
+    samples = model.replay_buffer.sample(8)
+    found = []
+    for bfloat16_targets in (False, True):
+        model.bfloat16_targets = bfloat16_targets
+        model._set_up_objective()
+        monkeypatch.setattr(th.nn.Conv2d, "forward", watched)
+        th.manual_seed(0)
+        found.append(loss_terms(model, samples))
+        monkeypatch.setattr(th.nn.Conv2d, "forward", conv2d)
+    float32, bfloat16 = seen[: len(seen) // 2], seen[len(seen) // 2 :]
+    assert {dtype for _, dtype in float32} == {th.float32}
+    assert set(bfloat16) == {(True, th.float32), (False, th.bfloat16)}
+    for name, loss in found[0].losses.items():
+        th.testing.assert_close(found[1].losses[name], loss, rtol=0.05, atol=0.02)
+    assert th.equal(found[0].losses["reward"], found[1].losses["reward"])  # it has no target
+
+
+def test_bfloat16_without_instructions_for_it_warns(make, monkeypatch):
+    monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx2": True, "avx512_bf16": False}, raising=False)
+    with pytest.warns(UserWarning, match="no instructions for bfloat16 on cpu"):
+        model = make(ChainEnv(), bfloat16_targets=True)
+    monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"amx_bf16": True}, raising=False)
+    assert model.learn(60)._n_updates > 0
+
+
 @pytest.mark.parametrize("symmetry_coef, n_encoded", [(0.0, 8 * 2), (1.0, 8 + 8 * 2)])
 def test_the_target_encodes_the_first_state_for_the_get_loss_only(make, monkeypatch, symmetry_coef, n_encoded):
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}, symmetry_coef=symmetry_coef).learn(44)

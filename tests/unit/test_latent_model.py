@@ -294,3 +294,17 @@ def test_convolutional_transition_by_hand():
     once = th.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0], dtype=th.float64) / 3  # ReLU(s - 2)
     th.testing.assert_close(found[0, 0], once, atol=1e-5, rtol=0)
     th.testing.assert_close(found[0, 1], once, atol=1e-5, rtol=0)  # s + 3, scaled to [0, 1] again
+
+
+@pytest.mark.parametrize("n_states", [2, 50])
+def test_projection_and_predictor_as_one_product(n_states):
+    """For many states, their weights are multiplied first."""
+    model = LatentModel(nn.Identity(), make_group("SE(2)"), 2, 3, LatentOptions(latent_hidden_dim=5)).double()
+    nn.init.normal_(model.predictor.weight)
+    nn.init.normal_(model.predictor.bias)
+    states = th.randn(n_states, model.state_dim, dtype=th.float64)
+    parameters = [*model.projection.parameters(), *model.predictor.parameters()]
+    outputs = [model.project(states), model.predictor(model.projection(states))]
+    gradients = [th.autograd.grad(output.square().sum(), parameters) for output in outputs]
+    th.testing.assert_close(*outputs, rtol=1e-12, atol=1e-12)
+    th.testing.assert_close(*gradients, rtol=1e-11, atol=1e-11)

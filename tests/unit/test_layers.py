@@ -31,6 +31,16 @@ def test_noise_does_not_depend_on_train_mode():
     assert th.equal(head(inputs), head(inputs))
 
 
+@pytest.mark.parametrize("n_states", [3, 20])
+def test_calls_share_one_draw_of_noise(n_states):
+    head = DistributionalHead(4, 2, 3, [8], nn.ReLU, dueling=True, sigma_init=0.5).double()
+    noise, inputs = head.draw_noise(), th.randn(n_states, 4, dtype=th.float64)
+    noise = [type(one)(*(part.double() for part in one)) for one in noise]
+    weights = head.with_noise(noise)
+    th.testing.assert_close(head(inputs, noise), head(inputs, weights), rtol=1e-12, atol=1e-12)
+    assert th.equal(head(inputs, weights), head(inputs, weights)) and not th.allclose(head(inputs, weights), head(inputs))
+
+
 def test_noise_follows_the_paper_for_every_layer():
     """f(ε) = sign(ε) √|ε|, drawn once for all layers: the outputs of the first, its inputs, the outputs of the second, ..."""
     layers = [NoisyLinear(6, 5), NoisyLinear(5, 2)]

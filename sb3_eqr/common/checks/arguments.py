@@ -116,6 +116,7 @@ ALGORITHM: dict[str, Rule] = {
     "shift_pixels": integer(0),
     "intensity_scale": WEIGHT,
     "cuda_graph": FLAG,
+    "bfloat16_targets": FLAG,
     "stats_window_size": integer(1),
     "tensorboard_log": TEXT | NONE,
     "policy_kwargs": DICTIONARY | NONE,

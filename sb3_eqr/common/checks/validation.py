@@ -250,6 +250,20 @@ def check_whitening(whiten: bool, batch_size: int) -> None:
         )
 
 
+def warn_of_slow_bfloat16(device: th.device) -> None:
+    """Warn if a device has no instructions for bfloat16."""
+    if device.type == "cuda":
+        is_fast = th.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        capabilities: dict[str, Any] = getattr(th.cpu, "get_capabilities", dict)()
+        is_fast = any(bool(there) for name, there in capabilities.items() if name.endswith("bf16"))  # avx512_bf16, amx_bf16
+    if not is_fast:
+        warnings.warn(
+            f"bfloat16_targets=True: PyTorch finds no instructions for bfloat16 on {device.type}, so updates may take longer. "
+            "Leave it out."
+        )
+
+
 def warn_of_idle_training(last_step: int, learning_starts: int | None, n_updates: int, buffer: Any) -> None:
     """Warn if a call of ``learn`` makes no updates, or if a trained agent has no replay buffer."""
     if learning_starts is not None and learning_starts >= last_step > 0:

@@ -3,13 +3,25 @@
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-Noise = tuple[th.Tensor, th.Tensor]  # for one layer: f(ε_out), (out_features,), and f(ε_in), (in_features,)
+
+class Noise(NamedTuple):
+    """The noise for one layer."""
+
+    out: th.Tensor  # f(ε_out), (out_features,)
+    into: th.Tensor  # f(ε_in), (in_features,)
+
+
+class NoisyWeights(NamedTuple):
+    """The weights of one layer with its noise, for several calls."""
+
+    weight: th.Tensor  # (out_features, in_features)
+    bias: th.Tensor  # (out_features,)
 
 
 class NoisyLinear(nn.Module):
@@ -35,20 +47,23 @@ class NoisyLinear(nn.Module):
         self.weight_sigma = nn.Parameter(th.full((out_features, in_features), sigma_init * bound))
         self.bias_sigma = nn.Parameter(th.full((out_features,), sigma_init * bound))
 
-    def forward(self, inputs: th.Tensor, noise: Noise | None = None) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, noise: Noise | NoisyWeights | None = None) -> th.Tensor:
         """
         :param inputs: (B, in_features)
-        :param noise: noise for this layer; ``None``: use the mean weights
+        :param noise: noise for this layer, or its weights with noise; ``None``: use the mean weights
         :return: (B, out_features)
         """
         if noise is None:
             return F.linear(inputs, self.weight, self.bias)
-        noise_out, noise_in = noise
-        if len(inputs) < self.SMALL_BATCH:
-            noisy = F.linear(inputs * noise_in, self.weight_sigma, self.bias_sigma)
-            return th.addcmul(F.linear(inputs, self.weight, self.bias), noisy, noise_out)
-        weight = th.addcmul(self.weight, self.weight_sigma, th.outer(noise_out, noise_in))
-        return F.linear(inputs, weight, th.addcmul(self.bias, self.bias_sigma, noise_out))
+        if isinstance(noise, Noise) and len(inputs) < self.SMALL_BATCH:
+            noisy = F.linear(inputs * noise.into, self.weight_sigma, self.bias_sigma)
+            return th.addcmul(F.linear(inputs, self.weight, self.bias), noisy, noise.out)
+        return F.linear(inputs, *(self.with_noise(noise) if isinstance(noise, Noise) else noise))
+
+    def with_noise(self, noise: Noise) -> NoisyWeights:
+        """The weights with this noise."""
+        weight = th.addcmul(self.weight, self.weight_sigma, th.outer(noise.out, noise.into))
+        return NoisyWeights(weight, th.addcmul(self.bias, self.bias_sigma, noise.out))
 
     def extra_repr(self) -> str:
         """As in ``nn.Linear``."""
@@ -66,7 +81,7 @@ def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
     weight = layers[0].weight
     noise = th.randn(sum(sizes), device=weight.device, dtype=weight.dtype)
     pieces = th.copysign(noise.abs().sqrt_(), noise).split_with_sizes(sizes)
-    return list(zip(pieces[::2], pieces[1::2], strict=True))
+    return list(map(Noise, pieces[::2], pieces[1::2]))
 
 
 def make_linear(n_in: int, n_out: int, sigma_init: float | None) -> nn.Linear | NoisyLinear:
@@ -89,7 +104,7 @@ class MLP(nn.Sequential):
             modules += [make_linear(n_in, n_out, sigma_init), activation_fn()]
         super().__init__(*modules[:-1])
 
-    def forward(self, inputs: th.Tensor, noise: Iterator[Noise] | None = None) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, noise: Iterator[Noise | NoisyWeights] | None = None) -> th.Tensor:
         """
         :param inputs: (B, sizes[0])
         :param noise: noise for the noisy layers, in order; ``None``: use their mean weights
@@ -140,13 +155,17 @@ class DistributionalHead(nn.Module):
         self._noisy_layers = [layer for module in modules for layer in module if isinstance(layer, NoisyLinear)]
 
     def draw_noise(self) -> list[Noise] | None:
-        """Draw noise for all layers, which calls of :meth:`forward` may share; ``None`` without noisy layers."""
+        """Draw noise for one call; ``None`` without noisy layers."""
         return draw_noise(self._noisy_layers) if self._noisy_layers else None
 
-    def forward(self, features: th.Tensor, noise: Sequence[Noise] | None = None) -> th.Tensor:
+    def with_noise(self, noise: list[Noise] | None) -> list[NoisyWeights] | None:
+        """The weights with this noise, for several calls."""
+        return None if noise is None else [layer.with_noise(n) for layer, n in zip(self._noisy_layers, noise, strict=True)]
+
+    def forward(self, features: th.Tensor, noise: Sequence[Noise | NoisyWeights] | None = None) -> th.Tensor:
         """
         :param features: (B, D)
-        :param noise: from :meth:`draw_noise`, the same for all samples; ``None``: use the mean weights
+        :param noise: from :meth:`draw_noise` or :meth:`with_noise`, for all samples; ``None``: use the mean weights
         :return: (B, N, A)
         """
         left = None if noise is None else iter(noise)  # for the layers to come
