@@ -19,4 +19,7 @@ __all__ = ["Diagnostics", "LatentCallback", "diagnose", "play", "record"]
 def __getattr__(name: str) -> Any:  # imported on use: the metrics need neither matplotlib nor imageio
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    try:
+        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    except ImportError as error:
+        raise ImportError(f'{error}. Run pip install ".[visualize]" in a clone of the repository.') from error

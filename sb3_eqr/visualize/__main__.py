@@ -18,7 +18,7 @@ from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictur
 from sb3_eqr.visualize.tables import all_tables, write_tables
 
 DEPTH = 5  # for agents without latent losses
-FLAGS = {"n_steps": "--steps", "depth": "--depth"}  # argument of play -> flag
+FLAGS = {"n_steps": "--steps", "depth": "--depth", "env": "--env"}  # argument of a function -> flag
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> None:
     import_packages(args.gym_packages)
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
-    env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust, args.gym_packages)
     depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
     try:
+        env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust, args.gym_packages)
         played = play(model, env, args.steps, depth, args.deterministic, args.seed)
     except ValueError as error:
         name, space, message = str(error).partition(" ")
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> None:
     figures = all_pictures(diagnostics, actions, factors)
     write_pictures(figures | latent_figures(model, played, factors, periodic), folder)
     if args.video:
-        from sb3_eqr.visualize.film import record  # only videos need its libraries
+        from sb3_eqr.visualize import record  # only videos need its libraries
 
         record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
     print(diagnostics.summary)

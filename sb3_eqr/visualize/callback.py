@@ -48,12 +48,16 @@ class LatentCallback(BaseCallback):
         self.n_windows = n_windows
         self.pictures = pictures
         self._looks = 0  # completed intervals
-        self._has_warned = False
 
     def _init_callback(self) -> None:
         check_agent("LatentCallback", self.model)
         if self.model.depth > 0:
             group_model(self.model)
+        else:
+            warnings.warn(
+                "LatentCallback logs nothing: the agent does not train its latent model, because prediction_depth is 0, "
+                "or aet_coef, symmetry_coef and reward_coef all are. Leave the callback out."
+            )
 
     def _on_training_start(self) -> None:
         self._looks = self.num_timesteps // self.log_freq
@@ -68,16 +72,8 @@ class LatentCallback(BaseCallback):
     def _look(self) -> None:
         buffer = self.model.replay_buffer
         assert buffer is not None
-        if self.model.depth == 0:  # the buffer has no rollouts, and nothing trains κ
-            if not self._has_warned:
-                warnings.warn(
-                    "LatentCallback logs nothing: the agent does not train its latent model, because prediction_depth is 0, "
-                    "or aet_coef, symmetry_coef and reward_coef all are. Leave the callback out."
-                )
-            self._has_warned = True
-            return
-        if buffer.prediction_depth == 0 or buffer.n_starts < 1:
-            return  # no window is complete yet
+        if 0 in (self.model.depth, buffer.prediction_depth) or buffer.n_starts < 1:
+            return  # the buffer has no windows, or none is complete yet
         play = replayed(self.model, self.n_windows, np.random.default_rng([self.model.seed or 0, self.num_timesteps]))
         found = diagnose(self.model, play)
         symmetry = np.nan if found.action_symmetry is None else found.action_symmetry.distance

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.utils import check_for_correct_spaces, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.checks.arguments import check, integer
@@ -62,8 +62,13 @@ def check_agent(name: str, model: Any) -> None:
 
 
 def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
-    """The environment, or that with this gymnasium id, with images channels first as in training."""
-    return model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
+    """The environment, or that with this gymnasium id, with images channels first; a ValueError if its spaces are others."""
+    found = model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
+    try:
+        check_for_correct_spaces(found, model.observation_space, model.action_space)
+    except ValueError as error:
+        raise ValueError(f"env must have the agent's spaces. {error}. Make it with the arguments of training.") from error
+    return found
 
 
 def reset(model: EqRAlgorithm, env: VecEnv, seed: int) -> Any:

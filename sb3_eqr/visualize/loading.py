@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_eqr.envs
@@ -18,7 +17,7 @@ from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.saving.models import data_of, read_model
 from sb3_eqr.trust import check_statistics, check_zoo_folder
-from sb3_eqr.visualize.latents import FACTOR_KEYS
+from sb3_eqr.visualize.latents import FACTOR_KEYS, as_vec_env
 
 
 def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqRAlgorithm:
@@ -103,14 +102,7 @@ def make_env(
         env = VecNormalize.load(str(statistics), env)
     if (normalize := unwrap_vec_normalize(env)) is not None:
         normalize.training = False
-    env = model._wrap_env(env, monitor_wrapper=False)
-    try:
-        check_for_correct_spaces(env, model.observation_space, model.action_space)
-    except ValueError as error:
-        raise ValueError(
-            f"--env does not have the agent's spaces. {error}. Pass the --env and --env-kwargs of training."
-        ) from error
-    return env
+    return as_vec_env(model, env)
 
 
 def _zoo_arguments(folder: pathlib.Path, trust: bool, packages: Sequence[str]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from sb3_eqr.common.saving.plain_data import encode as encode_plain
 from sb3_eqr.common.saving.random_state import get_rng_state
 from sb3_eqr.visualize import film as film_module
 from sb3_eqr.visualize.callback import LatentCallback
-from sb3_eqr.visualize.film import ARROW, AXES, HEIGHT, ROOM, WIDTH, Painter, Panel, panel, panels, record, shoot
+from sb3_eqr.visualize.film import ARROW, AXES, HEIGHT, ROOM, WIDTH, Film, Panel, frames, panel, record, shoot, still
 from sb3_eqr.visualize.latents import encode
 from tests.models import EITHER
 from tests.toys import ChainEnv, ImageEnv
@@ -34,62 +34,66 @@ def elements(name, n=7):
     return group, group.element(th.randn(n, group.num_params, generator=th.Generator().manual_seed(0)))
 
 
+def drawn(panels, picture=None, depth=2):
+    """The frames of some panels in one episode."""
+    n = panels[0].dots.shape[1]
+    picture = np.zeros((4, 4, 3), np.uint8) if picture is None else picture
+    return list(frames(Film(None, [picture] * n, ["up"] * n, None, np.zeros(n, int)), panels, "about", depth))
+
+
 def test_an_arrow_shows_the_rotation():
     """The element of SO(2) with the angle θ maps (1, 0) to (cos θ, -sin θ)."""
     angles = np.linspace(-3, 3, 13)
     group = make_group("SO(2)")
-    arrows, dots = film_module.in_plane(group, group.element(th.as_tensor(angles)[None, :, None]))
-    assert dots is None
-    np.testing.assert_allclose(np.arctan2(arrows[0, :, 0, 1], arrows[0, :, 0, 0]), -angles, atol=1e-6)
+    shown = panel("SO(2) 0", group, group.element(th.as_tensor(angles)[None, :, None]).expand(2, -1, -1, -1))
+    assert np.isnan(shown.dots).all()
+    np.testing.assert_allclose(np.arctan2(shown.arrows[0, :, 0, 1], shown.arrows[0, :, 0, 0]), -angles, atol=1e-6)
 
 
 def test_a_dot_shows_the_translation_and_its_arrow_the_rotation():
     group = make_group("SE(2)")
-    arrows, dots = film_module.in_plane(group, group.element(th.tensor([[[0.5, 3.0, -4.0]]], dtype=th.float64)))
-    np.testing.assert_allclose(dots, [[[3, -4]]])
-    np.testing.assert_allclose(arrows, rotation(0.5)[:, 0][None, None, None])
+    both = th.tensor([[[0.5, 3.0, -4.0], [0.5, -3.0, 4.0]]], dtype=th.float64).expand(2, -1, -1)
+    shown = panel("SE(2) 0", group, group.element(both))
+    np.testing.assert_allclose(shown.dots[0] * shown.half_width, [[3, -4], [-3, 4]])
+    np.testing.assert_allclose(shown.arrows[0, :, 0], ARROW * np.stack([rotation(0.5)[:, 0]] * 2))
 
 
 @pytest.mark.parametrize(
-    ("name", "n_arrows", "has_dot", "kind"),
+    ("name", "n_arrows", "has_dot"),
     [
-        ("SO(2)", 1, False, "arrow"),
-        ("SE(2)", 1, True, "arrow"),
-        ("GL(2)", 2, False, "parallelogram"),
-        ("GL(1)", 1, False, "arrow"),
-        ("SO(3)", 3, False, "axes"),
-        ("SE(3)", 3, True, "axes"),
-        ("SO(4)", 3, False, "axes"),
-        ("SE(1)", 0, True, "dot"),
-        ("T(1)", 0, True, "dot"),
-        ("T(2)", 0, True, "dot"),
-        ("T(5)", 0, True, "dot"),
-        ("none(6)", 0, True, "dot"),
+        ("SO(2)", 1, False),
+        ("SE(2)", 1, True),
+        ("GL(2)", 2, False),
+        ("GL(1)", 1, False),
+        ("SO(3)", 3, False),
+        ("SE(3)", 3, True),
+        ("SO(4)", 3, False),
+        ("SE(1)", 0, True),
+        ("T(1)", 0, True),
+        ("T(2)", 0, True),
+        ("T(5)", 0, True),
+        ("none(6)", 0, True),
     ],
 )
-def test_every_group_is_drawn_inside_its_panel(name, n_arrows, has_dot, kind):
+def test_every_group_is_drawn_inside_its_panel(name, n_arrows, has_dot):
     group, found = elements(name)
     ghost = found.clone()
     ghost[:2] = float("nan")
-    drawn = panel("1", group, th.stack([found, ghost]))
-    assert drawn.kind == kind
-    assert (drawn.arrows is None) == (n_arrows == 0) and (drawn.dots is not None) == has_dot
-    if n_arrows:
-        assert drawn.arrows.shape == (2, len(found), n_arrows, 2)
-    foot = np.zeros((len(found), 2)) if drawn.dots is None else drawn.dots[0]
-    tips = foot[:, None] if drawn.arrows is None else foot[:, None] + drawn.arrows[0]
-    assert np.abs(foot).max() <= 1 and np.abs(tips).max() <= 1 + 1e-9
-    for both in (drawn.arrows, drawn.dots):
-        if both is not None:
-            np.testing.assert_array_equal(both[1, 2:], both[0, 2:])  # both have the same scale
-            assert np.isnan(both[1, :2]).all()
-    Painter([drawn], np.zeros(len(found), int), 2, "").paint(1, np.zeros((4, 4, 3), np.uint8), "step 0")
+    shown = panel("1", group, th.stack([found, ghost]))
+    assert np.isfinite(shown.arrows[0, :, :, 0]).sum(axis=1).tolist() == [n_arrows] * len(found)
+    assert np.isfinite(shown.dots[0]).all() if has_dot else np.isnan(shown.dots).all()
+    feet = np.nan_to_num(shown.dots)[0]
+    assert np.abs(feet).max() <= 1 and np.abs(feet[:, None] + np.nan_to_num(shown.arrows[0])).max() <= 1 + 1e-9
+    for both in (shown.arrows, shown.dots):
+        np.testing.assert_array_equal(both[1, 2:], both[0, 2:])  # both have the same scale
+        assert np.isnan(both[1, :2]).all()
+    assert len(drawn([shown])) == len(found)
 
 
 @pytest.mark.parametrize("name, length", [("SO(2)", ROOM), ("SE(2)", ARROW)])
 def test_arrows_of_rotations_have_a_fixed_length(name, length):
     group, found = elements(name)
-    arrows = panel("1", group, th.stack([found, found])).arrows
+    arrows = panel("1", group, th.stack([found, found])).arrows[:, :, 0]
     np.testing.assert_allclose(np.linalg.norm(arrows, axis=-1), length, rtol=1e-6)
 
 
@@ -97,14 +101,16 @@ def test_a_panel_grows_for_predictions_except_outliers():
     group = make_group("T(2)")
     truth = th.tensor([[-1.0, 0.0], [1.0, 0.0]])
     assert panel("1", group, th.stack([truth, 2 * truth])).half_width == pytest.approx(2 / ROOM, rel=0.1)
-    assert panel("1", group, th.stack([truth, 100 * truth])).half_width == pytest.approx(1 / ROOM)
+    beyond = panel("1", group, th.stack([truth, 100 * truth]))
+    assert beyond.half_width == pytest.approx(1 / ROOM)
+    np.testing.assert_array_equal(beyond.dots[1], [[-1, 0], [1, 0]])  # at the edge
 
 
 def test_without_a_group_two_principal_components_are_drawn():
     t = th.linspace(-1, 1, 9)
     vectors = th.outer(t, th.tensor([0.0, 3.0, 4.0, 0.0])) + th.tensor([7.0, 7.0, 7.0, 7.0])
-    drawn = panel("1", make_group("none(4)"), th.stack([vectors, vectors]))
-    np.testing.assert_allclose(drawn.dots[0], np.stack([t * ROOM, 0 * t], axis=1), atol=1e-6)
+    dots = panel("1", make_group("none(4)"), th.stack([vectors, vectors])).dots[0]
+    np.testing.assert_allclose(dots * np.sign(dots[-1, 0]), np.stack([t * ROOM, 0 * t], axis=1), atol=1e-6)
 
 
 def rollout(model, state, actions):
@@ -143,13 +149,16 @@ def test_a_film_shows_what_happened(make):
     film = shoot(model, ChainEnv(8), STEPS, 3, True)
     env = DummyVecEnv([lambda: ChainEnv(8)])
     env.seed(3)
-    obs, start = env.reset(), 0
+    obs, start, score = env.reset(), 0, 0
     for t in range(STEPS):
         np.testing.assert_array_equal(film.observations[t], obs[0])
         action, _ = model.predict(obs, deterministic=True)
         obs, reward, done, _ = env.step(action)
         assert (film.actions[t], film.starts[t]) == (action[0], start)
-        assert film.rewards[t] == pytest.approx(reward[0])
+        score = reward[0] + (0 if t == start else score)
+        assert (
+            film.titles[t].split() == f"step {t - start} action {action[0]} reward {reward[0]:+.3g} score {score:.4g}".split()
+        )
         start = t + 1 if done[0] else start
 
 
@@ -168,25 +177,20 @@ def test_files_have_the_frames_and_the_global_generators_are_unchanged(make, gro
 
 
 @EITHER
-def test_a_video_suffix_is_removed(make, tmp_path):
-    paths = record(make("CartPole-v1"), "CartPole-v1", tmp_path / "v.mp4", 7, 2, formats=("gif",))
-    assert [path.name for path in paths] == ["v.gif"]
-
-
-def test_blocks_are_numbered_from_zero(make):
-    model = make(ChainEnv(8), symmetry_coef=0, policy_kwargs={"group": "SE(2)^2 x SO(3)", "n_blocks": None})
-    states = encode(model, th.zeros(2, 3))
-    assert [found.name for found in panels(model, th.stack([states, states]))] == ["0 SE(2)", "1 SE(2)", "2 SO(3)"]
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_video_suffix_is_removed(make, suffix, tmp_path):
+    paths = record(make("CartPole-v1"), "CartPole-v1", tmp_path / f"v{suffix}", 7, 2)
+    assert [path.name for path in paths] == ["v.mp4", "v.gif"]
 
 
 @pytest.mark.parametrize("name, letters", [("SO(3)", "xyz"), ("SE(3)", "xyz"), ("SE(2)", ""), ("SO(2)", "")])
 def test_the_legend_matches_what_is_drawn(name, letters):
-    """Each axis has its own colour; SO(3) has neither dots nor arrows of one colour."""
+    """Each axis has its own colour; only translations have trails."""
     group, found = elements(name)
-    painter = Painter([panel("0", group, th.stack([found, found]))], np.zeros(7, int), 2, "about" * 99)
-    (legend,) = painter.figure.legends
+    figure, _ = still([panel("0", group, th.stack([found, found]))], "about", 2)
+    (legend,) = figure.legends
     said = {text.get_text(): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
-    assert sum("predicted 2 steps before" in text for text in said) == 1 and ("now" in said) == (name != "SO(3)")
+    assert "now" in said and "predicted 2 steps before" in said
     assert ("last 12 steps" in said) == name.startswith("SE")
     assert {key: color for key, color in said.items() if key in "xyz"} == dict(zip(letters, AXES, strict=False))
 
@@ -211,7 +215,7 @@ def test_the_environment_is_rendered_if_possible(make):
     rendered = shoot(model, gym.make("CartPole-v1", render_mode="rgb_array"), 3, 0, True).pictures
     assert rendered[0].shape == (400, 600, 3)
     bars = shoot(model, gym.make("CartPole-v1"), 3, 0, True).pictures
-    assert bars[0].shape[2] == 3 and (bars[0] != bars[2]).any()
+    assert bars[0].shape == (4,) and (bars[0] != bars[2]).any()
 
 
 @EITHER
@@ -222,8 +226,8 @@ def test_several_normalised_environments(make):
     plain = VecNormalize(DummyVecEnv([lambda: ChainEnv(8), lambda: ChainEnv(8)]), training=False)
     film = shoot(model, plain, 9, 0, True)
     alone = shoot(model, ChainEnv(8), 9, 0, True)
-    assert film.observations.shape == (9, 3) and len(film.rewards) == 9
-    assert film.rewards[0] == pytest.approx(alone.rewards[0], abs=1e-6)
+    assert film.observations.shape == (9, 3) and len(film.titles) == 9
+    assert film.titles[0] == alone.titles[0] and "reward" in film.titles[0]
 
 
 def test_observations_as_images():
@@ -235,8 +239,8 @@ def test_observations_as_images():
     (picture,) = film_module.observed_pictures(planes, spaces.Box(0, 255, (4, 5, 6), np.uint8), 1)
     assert picture[2, 3].max() == 255 and len(set(picture[2, 3].tolist())) > 1 and picture.sum() == picture[2, 3].sum()
     space = spaces.Dict({"a": spaces.Box(-1, 1, (3,)), "b": spaces.Box(-1, 1, (20,))})
-    (picture,) = film_module.observed_pictures({"a": np.ones((1, 3)), "b": np.ones((1, 20))}, space, 1)
-    assert picture.ndim == 3
+    (numbers,) = film_module.observed_pictures({"a": np.array([[1.0, 0.0, -4.0]]), "b": np.ones((1, 20))}, space, 1)
+    np.testing.assert_array_equal(numbers, [1, 0, -1])
 
 
 @EITHER
@@ -244,14 +248,12 @@ def test_a_failed_video_leaves_no_files(make, tmp_path, monkeypatch):
     model = make(ChainEnv(8))
     old = tmp_path / "v.gif"
     old.write_bytes(b"old")
-    paint = Painter.paint
 
-    def fail(self, t, *args):
-        if t == 5:
-            raise RuntimeError("the disk is full")
-        return paint(self, t, *args)
+    def fail(*_):
+        yield from np.zeros((5, HEIGHT, WIDTH, 3), np.uint8)
+        raise RuntimeError("the disk is full")
 
-    monkeypatch.setattr(Painter, "paint", fail)
+    monkeypatch.setattr(film_module, "frames", fail)
     with pytest.raises(RuntimeError, match="the disk is full"):
         record(model, ChainEnv(8), tmp_path / "v", 9, 2)
     assert [path.name for path in tmp_path.iterdir()] == ["v.gif"] and old.read_bytes() == b"old"
@@ -260,24 +262,24 @@ def test_a_failed_video_leaves_no_files(make, tmp_path, monkeypatch):
 @EITHER
 def test_invalid_arguments_raise(make, tmp_path):
     model = make(ChainEnv(8))
-    with pytest.raises(ValueError, match="formats must be one or more of"):
-        record(model, ChainEnv(), tmp_path / "v", formats=("avi",))
     with pytest.raises(ValueError, match="n_steps must be an integer >= 6"):
         record(model, ChainEnv(), tmp_path / "v", n_steps=5)
-    with pytest.raises(ValueError, match="env must have the agent's observation_space"):
+    with pytest.raises(ValueError, match="env must have the agent's spaces"):
         record(model, ImageEnv(), tmp_path / "v")
 
 
 def test_a_frame_shows_truth_and_ghost():
     """Blue along the arrow, orange along the ghost's; nothing is orange without a ghost. Images keep their aspect ratio."""
-    arrows = np.array([[[[0.0, 0.85]]] * 2, [[[np.nan, np.nan]], [[0.85, 0.0]]]])
-    painter = Painter([Panel("1", "arrow", arrows, None, None)], np.zeros(2, int), 1, "")
-    picture = np.full((50, 100, 3), (0, 255, 0), np.uint8)
-    first, second = (painter.paint(t, picture, "up").astype(int) for t in (0, 1))
+    arrows = np.full((2, 2, 3, 2), np.nan)
+    arrows[0, :, 0], arrows[1, 1, 0] = (0, 0.85), (0.85, 0)
+    shown = Panel("1", 1.0, arrows, np.full((2, 2, 2), np.nan))
+    first, second = (frame.astype(int) for frame in drawn([shown], np.full((50, 100, 3), (0, 255, 0), np.uint8), depth=1))
+    figure, _ = still([shown], "about", 1)
+    figure.draw_without_rendering()
 
     def pixel(frame, x, y):
         """The colour at a position in the panel, whose edges are at ±1."""
-        column, row = painter.axes[0].transData.transform((x, y))
+        column, row = figure.axes[1].transData.transform((x, y))
         return frame[HEIGHT - round(row), round(column)]
 
     assert pixel(second, 0, 0.5)[2] > pixel(second, 0, 0.5)[0] + 50
@@ -285,14 +287,6 @@ def test_a_frame_shows_truth_and_ghost():
     assert not (first[:, 400:][..., 0] > first[:, 400:][..., 2] + 50)[60:-60].any()  # except in the legend
     green = (first == (0, 255, 0)).all(axis=2)
     assert green.any(axis=0).sum() == pytest.approx(2 * green.any(axis=1).sum(), abs=4)
-
-
-def test_a_block_beyond_its_panel_is_a_triangle_at_the_edge():
-    beyond = Panel("1", "dot", None, np.array([[[0.0, 0.0]], [[30.0, 0.0]]]), 1.0)
-    painter = Painter([beyond], np.zeros(1, int), 1, "")
-    (shown,) = film_module.moved(beyond, 1, 0, painter.artists[0][1])
-    assert np.allclose(shown.get_xydata(), [[0.95, 0.0]]) and shown.get_marker() == (3, 0, -90)
-    assert "beyond the edge" in [text.get_text() for text in painter.figure.legends[0].get_texts()]
 
 
 # --- the callback

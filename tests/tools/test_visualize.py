@@ -355,7 +355,7 @@ def saved(tmp_path_factory):
         ("{model} --env Ring-v1", "'Ring-v1' is not registered with gymnasium. Did you mean 'Ring-v0'?"),
         ("{model} --env Nope-v0", "'Nope-v0' is not registered with gymnasium. Environments of another package need"),
         ("{model} --env Ring-v0 --gym-packages no_package", "'no_package' cannot be imported"),
-        ("{model} --env CartPole-v1", "--env does not have the agent's spaces. Observation spaces do not match"),
+        ("{model} --env CartPole-v1", "--env must have the agent's spaces. Observation spaces do not match"),
         ("{model} --env Ring-v0 --env-kwargs unwound", "--env-kwargs must be key:value, got 'unwound'"),
         ("{model} --env Ring-v0 --env-kwargs speed:2", r"--env-kwargs: Ring-v0 does not accept {'speed': 2}"),
         ("{model} --env Ring-v0 --steps 5", "visualize: --steps must be an integer >= 8, got 5"),
