@@ -188,12 +188,14 @@ def still(panels: Sequence[Panel], about: str, depth: int) -> tuple[Figure, np.n
             ax.add_patch(Circle((x, y), ROOM, fill=False, edgecolor=LINE))
         ax.text(x - 0.94, y + 0.94, panel.name, va="top", color=GREY, fontsize=8 if n < 13 else 6)
         ax.text(x + 0.94, y - 0.94, f"edge ±{panel.half_width:.2g}", ha="right", color=GREY, fontsize=8 if n < 13 else 6)
-    looks: dict[str, Any] = {"now": DOT, f"predicted {depth} step{'s' if depth > 1 else ''} before": GHOST}
+    before = f"predicted {depth} step{'s' if depth > 1 else ''} before"
+    has_axes = any(np.isfinite(panel.arrows[0, 0, 1]).all() for panel in panels)
+    looks: dict[str, Any] = {} if has_axes else {"now": {"color": NOW}, before: {"color": PREDICTED}}  # single arrows
     if not all(np.isnan(panel.dots).all() for panel in panels):
-        looks[f"last {TRAIL} steps"] = TRACE
-    if any(np.isfinite(panel.arrows[0, 0, 1]).all() for panel in panels):
+        looks = {"now": DOT, before: GHOST, f"last {TRAIL} steps": TRACE}
+    if has_axes:
         looks |= {name: {"color": color} for name, color in zip("xyz", AXES, strict=True)}
-        looks["pale: predicted"] = {"color": PALE_AXES[0]}
+        looks[f"pale: {before}"] = {"color": PALE_AXES[0]}
     for label, look in looks.items():
         ax.plot([], [], label=label, **look)
     figure.legend(loc="lower right", ncols=len(looks), fontsize=8, handlelength=1.5, frameon=False)

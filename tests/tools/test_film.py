@@ -183,16 +183,22 @@ def test_a_video_suffix_is_removed(make, suffix, tmp_path):
     assert [path.name for path in paths] == ["v.mp4", "v.gif"]
 
 
-@pytest.mark.parametrize("name, letters", [("SO(3)", "xyz"), ("SE(3)", "xyz"), ("SE(2)", ""), ("SO(2)", "")])
-def test_the_legend_matches_what_is_drawn(name, letters):
-    """Each axis has its own colour; only translations have trails."""
+@pytest.mark.parametrize(
+    "name, has_dots, letters", [("SO(3)", 0, "xyz"), ("SE(3)", 1, "xyz"), ("SE(2)", 1, ""), ("SO(2)", 0, "")]
+)
+def test_the_legend_matches_what_is_drawn(name, has_dots, letters):
+    """Each axis has its own colour; only translations have dots and trails; the arrow of a plane is blue, its ghost orange."""
     group, found = elements(name)
     figure, _ = still([panel("0", group, th.stack([found, found]))], "about", 2)
     (legend,) = figure.legends
-    said = {text.get_text(): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
-    assert "now" in said and "predicted 2 steps before" in said
-    assert ("last 12 steps" in said) == name.startswith("SE")
-    assert {key: color for key, color in said.items() if key in "xyz"} == dict(zip(letters, AXES, strict=False))
+    said = {text.get_text(): line for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
+    expected = {"now", "predicted 2 steps before"} if has_dots or not letters else set()
+    expected |= {"last 12 steps"} if has_dots else set()
+    assert set(said) == expected | set(letters) | ({"pale: predicted 2 steps before"} if letters else set())
+    assert [said[letter].get_color() for letter in letters] == list(AXES[: len(letters)])
+    assert {said[label].get_marker() for label in expected - {"last 12 steps"}} == (
+        {"o"} if has_dots else {"None"} if expected else set()
+    )
 
 
 @EITHER
