@@ -462,3 +462,29 @@ def test_box_actions_must_be_finite(wrong):
     with pytest.raises(ValueError, match="action must be finite, got"):
         buffer.add(obs, obs, np.array([[wrong, 0.0]]), zero, zero, [{}])
     assert buffer.size() == 0
+
+
+NEEDS_GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NEEDS_GPU])])
+def test_frames_in_a_tensor_equal_those_in_an_array(device):
+    """As on a GPU; episodes of three steps make the store grow."""
+    kwargs = {"n_steps": 2, "prediction_depth": 3, "frame_stack": 4}
+    plain, other = (SequenceReplayBuffer(300, IMAGES, ACTIONS, where, 2, **kwargs) for where in ("cpu", device))
+    store = other._stores[""]
+    if device == "cpu":
+        store._frames = th.from_numpy(store._frames)
+    capacity = len(store._frames)
+    Stream(IMAGES, 2, mean_length=3).feed(400, plain, other)
+    assert len(store._frames) > capacity and isinstance(store._frames, th.Tensor)
+    a, b = draw(plain, 100), draw(other, 100)
+    assert th.equal(a.observations, b.observations.cpu()) and th.equal(a.rollout_observations, b.rollout_observations.cpu())
+    np.testing.assert_array_equal(store.__getstate__()["_frames"], plain._stores[""].__getstate__()["_frames"])
+
+
+def test_frames_that_a_gpu_has_no_room_for_stay_in_the_computer(monkeypatch):
+    monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (1000, 2000))
+    with pytest.warns(UserWarning, match=r"need 0.00 GB, and cuda has 0.00 GB left, so they stay"):
+        store = FrameStore(40, 1, (4, 84, 84), np.dtype(np.uint8), 4, "cuda")
+    assert isinstance(store._frames, np.ndarray)

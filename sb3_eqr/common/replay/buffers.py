@@ -77,7 +77,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         obs_spaces = observation_space.spaces if is_dict else {"": observation_space}  # type: ignore[attr-defined]
         obs_shapes = self.obs_shape if isinstance(self.obs_shape, dict) else {"": self.obs_shape}
         self._stores = {
-            key: FrameStore(self.buffer_size, n_envs, obs_shapes[key], space.dtype, frame_stack)  # type: ignore[arg-type]
+            key: FrameStore(self.buffer_size, n_envs, obs_shapes[key], space.dtype, frame_stack, self.device)  # type: ignore[arg-type]
             for key, space in obs_spaces.items()
         }
         shape = (self.buffer_size, n_envs)
@@ -263,7 +263,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         """As :meth:`FrameStore.observations`, normalised and moved to the device, for each key of a dict."""
         found = {key: store.observations(positions, envs, following) for key, store in self._stores.items()}
         is_dict = isinstance(self.observation_space, spaces.Dict)
-        observations = self._normalize_obs(found if is_dict else found[""], env)
+        if env is None:
+            return found if is_dict else found[""]
+        arrays = {key: obs.numpy(force=True) for key, obs in found.items()}
+        observations = self._normalize_obs(arrays if is_dict else arrays[""], env)
         if isinstance(observations, dict):
             return {key: self._tensor(obs) for key, obs in observations.items()}
         return self._tensor(observations)

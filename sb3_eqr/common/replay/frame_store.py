@@ -1,8 +1,10 @@
-"""Storage that keeps each frame once: frames in one array, and their indices for each transition."""
+"""Storage that keeps each frame once: frames in one array, on a GPU if the agent is there, and their indices for each pair."""
 
+import warnings
 from typing import Any
 
 import numpy as np
+import torch as th
 
 _ZERO = 0  # slot 0 always holds the zeros with which VecFrameStack pads the first observations of an episode
 
@@ -21,10 +23,20 @@ class FrameStore:
     :param obs_shape: shape of one observation; the first axis must be divisible by ``n_stack``
     :param dtype: dtype of the observations
     :param n_stack: number of frames per observation
+    :param device: where observations are returned. Frames are stored there, too, on a CPU or on a GPU that has room for them
     """
 
-    def __init__(self, n_positions: int, n_envs: int, obs_shape: tuple[int, ...], dtype: np.dtype, n_stack: int = 1):
+    def __init__(
+        self,
+        n_positions: int,
+        n_envs: int,
+        obs_shape: tuple[int, ...],
+        dtype: np.dtype,
+        n_stack: int = 1,
+        device: th.device | str = "cpu",
+    ):
         self.n_stack = n_stack
+        self.device = th.device(device)
         self.obs_shape = obs_shape
         self._frame_shape = (obs_shape[0] // n_stack, *obs_shape[1:])
         self._ids = np.zeros((n_positions, n_envs, n_stack + 1), dtype=np.int32)
@@ -35,13 +47,25 @@ class FrameStore:
         self._n_free = 0  # number of these that are free again, listed in the first entries of _free
 
     def _allocate_arrays(self, capacity: int, dtype: np.dtype) -> None:
-        self._frames = np.zeros((capacity, *self._frame_shape), dtype=dtype)
+        self.dtype = dtype
         self._references = np.zeros(capacity, dtype=np.int32)
         self._free = np.zeros(capacity, dtype=np.int32)
+        self._last: np.ndarray | None = None  # the newest next observations, (n_envs, n_stack, *frame_shape)
+        frames = np.zeros((capacity, *self._frame_shape), dtype=dtype)  # takes memory only as it is filled
+        self._frames: np.ndarray | th.Tensor = frames  # a tensor on a GPU
+        if self.device.type == "cuda":
+            free, _ = th.cuda.mem_get_info(self.device)
+            if frames.nbytes < free:
+                self._frames = th.zeros_like(th.from_numpy(frames), device=self.device)
+            else:
+                warnings.warn(
+                    f"The frames of the replay buffer need {frames.nbytes / 1e9:.2f} GB, and {self.device} has "
+                    f"{free / 1e9:.2f} GB left, so they stay in the computer's memory. Pass a smaller buffer_size."
+                )
 
     def emptied(self) -> "FrameStore":
         """An empty store of the same kind."""
-        return FrameStore(*self._ids.shape[:2], self.obs_shape, self._frames.dtype, self.n_stack)
+        return FrameStore(*self._ids.shape[:2], self.obs_shape, self.dtype, self.n_stack, self.device)
 
     @property
     def nbytes(self) -> int:
@@ -69,28 +93,43 @@ class FrameStore:
         if overwrite:
             self._release(self._ids[position])
         before = self._ids[position - 1]
-        same = _bits(self._frames[before[:, 1:]]) == _bits(stacks)
-        continues = same.reshape(len(stacks), -1).all(axis=1)
+        last = self._gathered(before[:, 1:]).numpy(force=True) if self._last is None else self._last
+        continues = (_bits(last) == _bits(stacks)).reshape(len(stacks), -1).all(axis=1)
         ids = np.empty_like(before)
         ids[:, :-1] = before[:, 1:]
         for env in np.flatnonzero(~continues):  # the first step of an episode
             ids[env, :-1] = self._store_stack(stacks[env])
         ids[:, -1] = self._take_slots(len(stacks))
-        self._frames[ids[:, -1]] = next_stacks[:, -1]
+        self._put(ids[:, -1], next_stacks[:, -1])
+        self._last = next_stacks.copy()
         np.add.at(self._references, ids, 1)
         self._ids[position] = ids
         return continues
 
-    def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> np.ndarray:
+    def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> th.Tensor:
         """
         The observations, or with ``following`` the next observations, of the pairs of ``envs`` at ``positions``, both (...)
-        and broadcast: a copy, (..., *obs_shape).
+        and broadcast: a copy on the device, (..., *obs_shape).
         """
         ids = self._ids[positions, envs, 1:] if following else self._ids[positions, envs, :-1]  # (..., n_stack)
-        return self._frames[ids].reshape(*ids.shape[:-1], *self.obs_shape)
+        return self._gathered(ids).view(*ids.shape[:-1], *self.obs_shape).to(self.device)
+
+    def _gathered(self, ids: np.ndarray) -> th.Tensor:
+        """A copy of the frames with these ids, (..., *frame_shape)."""
+        if isinstance(self._frames, np.ndarray):  # a quarter faster than through PyTorch
+            return th.from_numpy(self._frames[ids])
+        index = th.from_numpy(ids.reshape(-1)).to(self.device, non_blocking=True)
+        return self._frames.index_select(0, index).view(*ids.shape, *self._frame_shape)
+
+    def _put(self, ids: np.ndarray, frames: np.ndarray) -> None:
+        """Store frames, (N, *frame_shape), in these slots, (N,)."""
+        if isinstance(self._frames, np.ndarray):
+            self._frames[ids] = frames
+        else:
+            self._frames[th.from_numpy(ids).to(self.device)] = th.from_numpy(frames.copy()).to(self.device)
 
     def _as_stacks(self, obs: np.ndarray) -> np.ndarray:
-        return np.asarray(obs, dtype=self._frames.dtype).reshape(len(obs), self.n_stack, *self._frame_shape)
+        return np.asarray(obs, dtype=self.dtype).reshape(len(obs), self.n_stack, *self._frame_shape)
 
     def _store_stack(self, stack: np.ndarray) -> list[int]:
         ids: list[int] = []
@@ -100,8 +139,9 @@ class FrameStore:
             elif k > 0 and np.array_equal(_bits(frame), _bits(stack[k - 1])):  # padding with the first frame
                 ids.append(ids[-1])
             else:
-                ids.append(int(self._take_slots(1)[0]))
-                self._frames[ids[-1]] = frame
+                slot = self._take_slots(1)
+                ids.append(int(slot[0]))
+                self._put(slot, frame[None])
         return ids
 
     def _take_slots(self, count: int) -> np.ndarray:
@@ -116,7 +156,14 @@ class FrameStore:
 
     def _grow(self) -> None:
         capacity = self._n_used + len(self._frames) // 16
-        for array in (self._frames, self._references, self._free):  # in place: the system moves pages, not bytes
+        arrays = [self._references, self._free]
+        if isinstance(self._frames, np.ndarray):
+            arrays.append(self._frames)
+        else:
+            grown = self._frames.new_zeros(capacity, *self._frame_shape)
+            grown[: len(self._frames)] = self._frames
+            self._frames = grown
+        for array in arrays:  # in place: the system moves pages, not bytes
             array.resize((capacity, *array.shape[1:]), refcheck=False)
 
     def _release(self, ids: np.ndarray) -> None:
@@ -129,18 +176,22 @@ class FrameStore:
     def __getstate__(self) -> dict[str, Any]:
         """Save only used slots, so that the file size is proportional to the number of stored transitions."""
         state = self.__dict__.copy()
+        for name in ("_last", "device", "dtype"):
+            del state[name]
         state["_capacity"] = len(self._frames)
         for name in ("_frames", "_references", "_free"):
-            state[name] = state[name][: self._n_used]
+            used = state[name][: self._n_used]
+            state[name] = used.numpy(force=True) if isinstance(used, th.Tensor) else used
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved = {name: state.pop(name) for name in ("_frames", "_references", "_free")}
         capacity = state.pop("_capacity")
-        self.__dict__.update(state)
+        self.__dict__.update({"device": th.device("cpu"), **state})
         self._allocate_arrays(capacity, saved["_frames"].dtype)
         for name, array in saved.items():
-            getattr(self, name)[: len(array)] = array
+            target = getattr(self, name)
+            target[: len(array)] = th.from_numpy(array) if isinstance(target, th.Tensor) else array
 
 
 def _bits(array: np.ndarray) -> np.ndarray:

@@ -103,9 +103,8 @@ def _store(value: Any, like: FrameStore, name: str, archive: zipfile.ZipFile, re
     n, n_envs, length = like._ids.shape
     n = resized.get(n, n)
     shapes = {"_ids": (n, n_envs, length), **{key: (n_used, *getattr(like, key).shape[1:]) for key in USED}}
-    arrays = {
-        key: _array(value[key], getattr(like, key).dtype, shape, f"{name}.{key}", archive) for key, shape in shapes.items()
-    }
+    dtypes = {key: like.dtype if key == "_frames" else np.dtype(np.int32) for key in shapes}
+    arrays = {key: _array(value[key], dtypes[key], shape, f"{name}.{key}", archive) for key, shape in shapes.items()}
     for slots in (arrays["_ids"], arrays["_free"][:n_free]):
         if slots.size and not 0 <= slots.min() <= slots.max() < n_used:
             raise ValueError(f"{name} must refer to slots below {n_used}")
