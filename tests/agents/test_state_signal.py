@@ -208,7 +208,7 @@ def test_the_trunk_for_vectors():
 
 @pytest.mark.parametrize("configuration, low, high", [("default", 0.2, np.inf), ("paper", 0.0, 0.01)])
 def test_the_logits_of_a_new_agent_depend_on_the_frames(configuration, low, high):
-    """Their spread over frames of Krull, compared with that over noise samples (experiments/notes/gradients.md has three games)."""
+    """Their spread over frames of Krull, compared with that over noise samples (experiments/notes/gradients.md)."""
     arguments = {} if configuration == "default" else load_configuration(configuration)
     small = {"buffer_size": 400, "learning_starts": 300, "seed": 0}
     model = EqRRainbow("CnnPolicy", make_atari100k_env("Krull", seed=0), **{**arguments, **small}).learn(200)
