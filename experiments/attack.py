@@ -13,38 +13,35 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import torch as th
 
-from experiments.attacks import Finding, command_lines, files, inputs, kills, numbers, resumes
+from experiments.attacks import Finding, files, inputs, kills, numbers, resumes
+from experiments.attacks.command_lines import wrong_command_lines
 
 
-def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Callable[[], Finding]]]:
+def attacks(folder: pathlib.Path, n_kills: int, rng: random.Random) -> dict[str, list[Callable[[], Finding]]]:
     """
     :param folder: folder for temporary files
     :param n_kills: number of kills per test that kills
-    :param seed: seed of the times of kills and places of damage
+    :param rng: chooses the times of kills and the places of damage
     :return: tests by their name in ``--only``
     """
-    rng = random.Random(seed)
     return {
         "kills": [
-            lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=1),
-            lambda: kills.killed_runs(folder / "runs", n_kills, rng, at_once=2),
-            lambda: kills.killed_benchmark(folder / "benchmark", n_kills, rng),
+            partial(kills.killed_runs, folder / "runs", n_kills, rng, at_once=1),
+            partial(kills.killed_runs, folder / "runs", n_kills, rng, at_once=2),
+            partial(kills.killed_benchmark, folder / "benchmark", n_kills, rng),
         ],
-        "resumes": [lambda: resumes.resumed_runs(folder / "resumed")],
-        "inputs": [
-            inputs.wrong_arguments,
-            inputs.without_asserts,
-            lambda: command_lines.wrong_command_lines(folder / "lines"),
-        ],
-        "numbers": [lambda: numbers.not_a_number(folder / "numbers")],
+        "resumes": [partial(resumes.resumed_runs, folder / "resumed")],
+        "inputs": [inputs.wrong_arguments, inputs.without_asserts, partial(wrong_command_lines, folder / "lines")],
+        "numbers": [partial(numbers.not_a_number, folder / "numbers")],
         "files": [
-            lambda: files.strangers_files(folder / "hostile"),
-            lambda: files.damaged_files(folder / "damaged", rng),
-            lambda: files.full_disk(folder / "disk"),
-            lambda: files.shared_path(folder / "shared"),
+            partial(files.strangers_files, folder / "hostile"),
+            partial(files.damaged_files, folder / "damaged", rng),
+            partial(files.full_disk, folder / "disk"),
+            partial(files.shared_path, folder / "shared"),
         ],
     }
 
@@ -52,9 +49,8 @@ def attacks(folder: pathlib.Path, n_kills: int, seed: int) -> dict[str, list[Cal
 def main() -> None:
     """Parse the command line, run the tests, write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--only", nargs="+", choices=list(attacks(pathlib.Path(), 0, 0)), help="a subset of the parts (default: all)"
-    )
+    parts = list(attacks(pathlib.Path(), 0, random.Random()))
+    parser.add_argument("--only", nargs="+", choices=parts, default=parts, help="a subset of the parts (default: all)")
     parser.add_argument("--kills", type=int, default=100, help="number per test that kills (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="seed of times and places (default: 0)")
     parser.add_argument("--out", type=pathlib.Path, help="a Markdown file for the table")
@@ -64,14 +60,14 @@ def main() -> None:
     rows = ["| test | must | found | seconds |", "|---|---|---|---|"]
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
-        for name, tests in attacks(pathlib.Path(folder), args.kills, args.seed).items():
-            for test in tests if args.only is None or name in args.only else []:
-                began = time.monotonic()
-                finding = test()
-                failed += not finding.holds
-                mark = "" if finding.holds else "**falls short:** "
-                rows.append(f"| {finding.test} | {finding.must} | {mark}{finding.found} | {time.monotonic() - began:.0f} |")
-                print(rows[-1], *finding.details, sep="\n  ", flush=True)
+        tests = attacks(pathlib.Path(folder), args.kills, random.Random(args.seed))
+        for test in (one for part, those in tests.items() if part in args.only for one in those):
+            began = time.monotonic()
+            finding = test()
+            failed += not finding.holds
+            mark = "" if finding.holds else "**falls short:** "
+            rows.append(f"| {finding.test} | {finding.must} | {mark}{finding.found} | {time.monotonic() - began:.0f} |")
+            print(rows[-1], *finding.details, sep="\n  ", flush=True)
     if args.out is not None:
         command = f"python -m experiments.attack --kills {args.kills} --seed {args.seed}"
         args.out.write_text("\n".join(["# Attacks", "", f"```sh\n{command}\n```", "", *rows, ""]), encoding="utf-8")

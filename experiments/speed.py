@@ -1,5 +1,5 @@
 """
-The cost of an update and of an environment step: ``python -m experiments.speed`` (docs/results/speed.md).
+The cost of an update and of replay, also by size: ``python -m experiments.speed`` (docs/results/speed.md).
 
 The agents compared run alternately in one process. Milliseconds are medians over the rounds; ratios are computed within each
 round, and their median is shown.
@@ -12,43 +12,39 @@ import pathlib
 import platform
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import cycle, product
+from itertools import cycle
+from math import log2
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import stable_baselines3
 import torch as th
-from torch.profiler import ProfilerActivity, profile, record_function
-from torch.utils.benchmark import Timer, timer
+from gymnasium import spaces
+from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
 from experiments.clock import Table, count_operations, median, take_turns
-from experiments.sizes import STORED, measure_sizes
-from experiments.workload import (
-    AGENTS,
-    BEFORE,
-    EQR_AGENTS,
-    N_STORED,
-    NETWORKS,
-    Floor,
-    bytes_per_transition,
-    fill,
-    make_agent,
-    make_trainable,
-)
+from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, N_STACK, NETWORKS, SIZE, Floor, fill, make_agent
+from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
 TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others that warm up
-N_ACTED, N_OPERATIONS = 100, 20  # steps in a round, rows of the profile
 NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
+AGENT = "EqRQRDQN"  # of sizes
+STORED, FILLED_BY = (10_000, 100_000, 1_000_000), 20  # transitions, and number of environments that add them
+N_ENVS, N_PLAYED, N_UPDATES, N_DRAWS = (1, 8, 32), 256, 2, 30
+VARIANTS: dict[str, dict[Any, dict[str, Any]]] = {
+    "M": {m: {"prediction_depth": m} for m in (0, 1, 2, 3, 5, 7, 10)},
+    "K": {k: {"policy_kwargs": {"n_blocks": k}} for k in (4, 8, 16, 32, 64)},
+    "group": {group: {"policy_kwargs": {"group": group}} for group in ("SE(2)", "SE(3)", "SO(6)", "GL(4)")},
+}
+Call = Callable[[], object]
+Row = dict[str, Any]
 
 
 def in_rounds_of_one(model: Any, n_updates: int) -> None:
@@ -60,10 +56,10 @@ def in_rounds_of_one(model: Any, n_updates: int) -> None:
 def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
     """An update of each agent on each network, compared with QRDQN's and the floor, in long rounds and in rounds of one."""
     for key in args.network or NETWORKS:
-        n_updates, models = NETWORKS[key].n_updates, {name: make_trainable(name, key, N_BEFORE) for name in AGENTS}
+        n_updates, models = NETWORKS[key].n_updates, {name: workload.make_trainable(name, key, N_BEFORE) for name in AGENTS}
         counted = {name: count_operations(partial(one.train, N_COUNTED, one.batch_size)) for name, one in models.items()}
-        floor = Floor(models["EqRQRDQN"]) if key == "atari" else None
-        calls: dict[str, Callable[[], object]] = {FLOOR: partial(floor.steps, n_updates)} if floor else {}
+        floor = Floor(models[AGENT]) if key == "atari" else None
+        calls: dict[str, Call] = {FLOOR: partial(floor.steps, n_updates)} if floor else {}
         for name, model in models.items():
             calls[name] = partial(model.train, n_updates, model.batch_size)
             calls[name + ONES] = partial(in_rounds_of_one, model, n_updates)
@@ -72,14 +68,14 @@ def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
         def ratio(name: str, other: str, found: dict[str, Any] = found) -> float | None:
             return found[name].ratio(found[other]) if name in found and other in found else None
 
-        rows: list[dict[str, Any]] = []
+        rows: list[Row] = []
         for name in [FLOOR, *models] if floor else models:
             row = {"name": name, "ms": median(found[name].ms), "cpu_ms": median(found[name].cpu_ms)}
             row |= {"times_QRDQN": ratio(name, "QRDQN"), "times_floor": ratio(name, FLOOR)}
             row |= {"times_before": ratio(name, name + BEFORE), "round_of_one": ratio(name + ONES, name)}
             row |= {"operations": counted[name] / N_COUNTED if name in models else None}
             row |= {"page_faults": median(found[name].faults)}
-            row |= {"bytes_per_transition": bytes_per_transition(models[name]) if floor and name in models else None}
+            row |= {"bytes_per_transition": workload.bytes_per_transition(models[name]) if floor and name in models else None}
             rows.append(row)
         notes = [floor.description()] if floor else []
         yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
@@ -87,7 +83,7 @@ def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
 
 def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
     """Updates on Atari frames with one and with two threads, while another process is busy."""
-    models = {name: make_trainable(name) for name in ("DQN", "QRDQN", *EQR_AGENTS)}
+    models = {name: workload.make_trainable(name) for name in ("DQN", "QRDQN", *EQR_AGENTS)}
 
     def update(model: Any, n_threads: int) -> None:
         th.set_num_threads(n_threads)
@@ -108,110 +104,115 @@ def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
     yield Table("neighbour", "Update, atari, beside a busy process", rows)
 
 
-def acting_and_storing(name: str, network: str) -> tuple[Callable[[], object], Callable[[], object]]:
-    """The two calls of an agent per environment step: choose an action with its network, and store a transition."""
-    model = make_trainable(name, network)
-    env, transitions = model.env, []
-    obs = env.reset()
-    for _ in range(N_ACTED):
-        actions = np.array([env.action_space.sample()])
-        before, (obs, *rest) = obs, env.step(actions)
-        transitions.append((before, (actions, obs, *rest)))
-    stream = cycle(transitions)
-
-    def store() -> None:
-        model._last_obs, transition = next(stream)
-        model._store_transition(model.replay_buffer, *transition)
-
-    return partial(model._sample_action, 0), store
-
-
-def measure_steps(args: argparse.Namespace) -> Iterator[Table]:
-    """Acting and storing: an environment step without the environment itself and without updates."""
-    clock = time.process_time if args.threads == 1 else timer
-    for key in args.network or NETWORKS:
-        calls = {name: acting_and_storing(name, key) for name in AGENTS}
-        options: dict[str, Any] = {"timer": clock, "num_threads": args.threads}
-        timers = [Timer("call()", globals={"call": call}, **options) for both in calls.values() for call in both]
-        rounds = [[one.timeit(N_ACTED).median * 1e3 for one in timers] for _ in range(args.rounds)]
-        acting, storing = np.array(rounds).reshape(args.rounds, -1, 2).T  # (agents, rounds) each
-        whole = acting + storing
-        columns = {"ms_acting": acting, "ms_storing": storing, "ms": whole}
-        columns["times_QRDQN"] = whole / whole[list(calls).index("QRDQN")]
-        rows = [{"name": name} | {key: median(ms[i]) for key, ms in columns.items()} for i, name in enumerate(calls)]
-        yield Table(f"steps_{key}", f"Step of the environment without the environment, {key}", rows)
-
-
-def measure_profile(args: argparse.Namespace) -> Iterator[Table]:
-    """The time of an update by stage and operation, from PyTorch's profiler, whose overhead is included."""
-    for key, name in product(args.network or ["minatar"], EQR_AGENTS):
-        model = make_trainable(name, key, N_BEFORE)
-        policy, buffer = model.policy, model.replay_buffer
-        stages = {"sample": buffer, "objective": model, "backward": th.Tensor}
-        stages |= {"step": policy.optimizer, "update_target": policy, "update_priorities": buffer}
-        with ExitStack() as stack:
-            for stage, owner in stages.items():
-                ranged = record_function(f"stage {stage}")(getattr(owner, stage))
-                stack.enter_context(mock.patch.object(owner, stage, ranged))
-            profiled = stack.enter_context(profile(activities=[ProfilerActivity.CPU]))
-            model.train(N_COUNTED, model.batch_size)
-        rows: list[dict[str, Any]] = []
-        for event in sorted(profiled.key_averages(), key=lambda event: -event.self_cpu_time_total):
-            times = {"ms": event.cpu_time_total / N_COUNTED / 1e3, "self_ms": event.self_cpu_time_total / N_COUNTED / 1e3}
-            rows.append({"name": event.key, "calls": event.count / N_COUNTED, **times})
-        shown = [row for row in rows if row["name"].startswith("stage")]
-        shown += [row for row in rows if row not in shown][:N_OPERATIONS]
-        notes = [f"all: {sum(row['self_ms'] for row in rows):.2f} ms; self: excluding nested calls"]
-        yield Table(f"profile_{name}_{key}", f"Update of {name} by stage and operation, {key}", shown, notes)
-
-
 def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
     """Updates captured as a CUDA graph: they must differ from eager ones no more than these from their own repetition."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for name in EQR_AGENTS:
         agents = []
         for graph in (False, False, True):
             agents.append(make_agent(name, device=args.device, cuda_graph=graph))  # which seeds the generators
-            fill(agents[-1].replay_buffer, N_STORED)
+            fill(agents[-1].replay_buffer, workload.N_STORED)
             agents[-1].train(N_BEFORE, agents[-1].batch_size)
         eager, again, captured = (th.cat([p.detach().flatten() for p in one.policy.parameters()]) for one in agents)
         apart_again, apart = (again - eager).abs().max().item(), (captured - eager).abs().max().item()
         failure = agents[2]._captured.failure
         is_right = apart <= max(TOLERANCE, 2 * apart_again) and (failure is None or args.device == "cpu")
-        floor, n_updates = Floor(agents[0]), NETWORKS["atari"].n_updates
-        calls: dict[str, Callable[[], object]] = {FLOOR: partial(floor.steps, n_updates)}
-        calls |= {
-            way: partial(one.train, n_updates, one.batch_size)
-            for way, one in zip(("eager", "captured"), agents[1:], strict=True)
-        }
+        n_updates, models = NETWORKS["atari"].n_updates, {"eager": agents[1], "captured": agents[2]}
+        calls: dict[str, Call] = {FLOOR: partial(Floor(agents[0]).steps, n_updates)}
+        calls |= {way: partial(one.train, n_updates, one.batch_size) for way, one in models.items()}
         times = {f"{way}_ms": median(found.ms) for way, found in take_turns(calls, args.rounds, n_updates).items()}
-        rows.append(
-            {
-                "name": name,
-                **times,
-                "eager_again": apart_again,
-                "captured": apart,
-                "capture": failure or "captured",
-                "ok": is_right,
-            }
-        )
-    notes = [
-        f"eager_again, captured: largest difference of a parameter from an eager agent's, {N_BEFORE} updates from one seed"
-    ]
+        apart_by = {"eager_again": apart_again, "captured": apart}
+        rows.append({"name": name, **times, **apart_by, "capture": failure or "captured", "ok": is_right})
+    what = "largest difference of a parameter from an eager agent's"
+    notes = [f"eager_again, captured: {what}, {N_BEFORE} updates from one seed"]
     yield Table("graph", f"Update as a CUDA graph, atari, {args.device}", rows, notes)
 
 
-MEASURES = (measure_updates, measure_neighbour, measure_steps, measure_profile, measure_graph, measure_sizes)
-PARTS = {measure.__name__.removeprefix("measure_"): measure for measure in MEASURES}
+def growth(costs: Sequence[float], arithmetic: Sequence[float]) -> list[float]:
+    """Growth of the costs since the first size, divided by that of the arithmetic, in any unit."""
+    return [(cost / costs[0]) / (work / arithmetic[0]) for cost, work in zip(costs, arithmetic, strict=True)]
+
+
+def repeat(call: Call) -> list[object]:
+    """Call it ``N_DRAWS`` times, since one call is too short to time."""
+    return [call() for _ in range(N_DRAWS)]
+
+
+def drawing_and_updating(size: int) -> dict[str, Call]:
+    """Calls on a full buffer of ``size`` transitions: prioritised and uniform batches, and new priorities."""
+    space, actions = spaces.Box(0, 255, (N_STACK, SIZE, SIZE), np.uint8), spaces.Discrete(workload.N_ACTIONS)
+    windows: dict[str, Any] = {"n_steps": 10, "prediction_depth": 5, "frame_stack": N_STACK}  # Table 5
+    buffer = PrioritizedSequenceReplayBuffer(size, space, actions, "cpu", FILLED_BY, **windows)
+    fill(buffer, size // FILLED_BY)
+    n_drawable = (buffer.buffer_size - buffer.window) * buffer.n_envs
+    batches = cycle(np.random.default_rng(0).integers(0, n_drawable, (1_000, BATCH_SIZE)))
+    priorities = th.rand(BATCH_SIZE)
+    return {
+        "sample": partial(buffer.sample, BATCH_SIZE),
+        "update_priorities": lambda: buffer.update_priorities(next(batches), priorities),
+        "uniform_sample": partial(SequenceReplayBuffer.sample, buffer, BATCH_SIZE),
+    }
+
+
+def measure_stored(args: argparse.Namespace) -> Table:
+    """Time of a batch of windows by number of stored transitions, up to the largest."""
+    sizes = [size for size in STORED if size <= args.largest]
+    work = {size: drawing_and_updating(size) for size in sizes}
+    calls = {f"{what} {size}": partial(repeat, call) for size in sizes for what, call in work[size].items()}
+    found = take_turns(calls, args.rounds, N_DRAWS)
+    rows: list[Row] = [{"transitions": size} for size in sizes]
+    for what in work[sizes[0]]:
+        costs = [median(found[f"{what} {size}"].ms) for size in sizes]
+        grown = growth(costs, [1.0 if what == "uniform_sample" else log2(size) for size in sizes])
+        for place, row in enumerate(rows):
+            row |= {f"{what}_ms": costs[place], f"{what}_growth": grown[place]}
+    notes = ["growth: of the time, over that of log2 of the transitions where priorities are used"]
+    return Table("stored_transitions", f"Replay, a batch of {BATCH_SIZE} windows, n = 10, M = 5", rows, notes)
+
+
+def measure_n_envs(args: argparse.Namespace) -> Table:
+    """Time of acting and storing by number of environments in one process."""
+    models = {str(n): make_agent(AGENT, env=workload.make_env("atari", n)) for n in N_ENVS}
+    found = take_turns({n: partial(workload.play, one, N_PLAYED) for n, one in models.items()}, args.rounds, N_PLAYED)
+    rows = [{"n_envs": n, "ms": median(found[n].ms), "growth": median(found[n].ms) / median(found["1"].ms)} for n in models]
+    return Table("n_envs", f"Environments of random frames, {AGENT}: step of one environment, without updates", rows)
+
+
+def measure_variants(size: str, rounds: int) -> Table:
+    """Time of an update by M, K or the group, compared with the floor."""
+    models = {str(value): workload.make_trainable(AGENT, **kwargs) for value, kwargs in VARIANTS[size].items()}
+    floors = {name: Floor(model) for name, model in models.items()}
+    calls: dict[str, Call] = {f"floor {name}": partial(floors[name].steps, N_UPDATES) for name in models}
+    calls |= {name: partial(model.train, N_UPDATES, model.batch_size) for name, model in models.items()}
+    found = take_turns(calls, rounds, N_UPDATES)
+    rows: list[Row] = []
+    for name, model in models.items():
+        with FlopCounterMode(display=False) as counter:
+            model.train(1, model.batch_size)
+        step, floor, gflop = found[name], found[f"floor {name}"], counter.get_total_flops() / 1e9
+        row = {size: name, "GFLOP": gflop, "GFLOP_beyond_floor": gflop - floors[name].flop / 1e9, "ms": median(step.ms)}
+        row |= {"times_floor": step.ratio(floor), "ms_beyond_floor": median(step.ms - floor.ms)}
+        rows.append({**row, "page_faults": median(step.faults)})
+    grown = growth([row["ms_beyond_floor"] for row in rows], [row["GFLOP_beyond_floor"] for row in rows])
+    rows = [{**row, "growth": value} for row, value in zip(rows, grown, strict=True)]
+    return Table(size, f"Update of {AGENT} by {size}", rows, ["growth: of ms over that of GFLOP, both beyond the floor"])
+
+
+def measure_sizes(args: argparse.Namespace) -> Iterator[Table]:
+    """Cost against size: stored transitions, environments, depth M, blocks K, groups."""
+    yield from (measure_stored(args), measure_n_envs(args))
+    yield from (measure_variants(size, args.rounds) for size in VARIANTS)
+
+
+PARTS = {"updates": measure_updates, "neighbour": measure_neighbour, "graph": measure_graph, "sizes": measure_sizes}
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the given arguments, or else the command line; argparse reports wrong ones."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=__doc__.strip().split("\n")[0])
-    several, usual = partial(str.split, sep=","), [part for part in PARTS if part not in ("sizes", "graph")]
-    parser.add_argument("--only", metavar="PARTS", type=several, default=usual, help=f"some of {', '.join(PARTS)}")
-    networks = f"some of {', '.join(NETWORKS)}; default: all, but minatar for profile"
-    parser.add_argument("--network", metavar="NETWORKS", type=several, help=networks)
+    several = partial(str.split, sep=",")
+    parser.add_argument("--only", type=several, default=["updates", "neighbour"], help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("--network", type=several, help=f"of updates: some of {', '.join(NETWORKS)}; default: all")
     parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
     parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
     parser.add_argument("--device", default="cpu", help="of graph: cuda, or cpu to test the script")
@@ -236,10 +237,12 @@ def surroundings(args: argparse.Namespace) -> dict[str, Any]:
     info = pathlib.Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    cpu = names[0] if names else platform.processor() or platform.machine()
     versions = {"torch": th.__version__, "SB3": stable_baselines3.__version__, "numpy": np.__version__}
-    about = {"command": f"python -m experiments.speed {' '.join(sys.argv[1:])}", "cpu": cpu, "cores": os.cpu_count()}
-    about |= {"threads": args.threads, "rounds": args.rounds, "python": platform.python_version()}
+    about: dict[str, Any] = {
+        "command": f"python -m experiments.speed {' '.join(sys.argv[1:])}",
+        "cpu": [*names, platform.machine()][0],
+    }
+    about |= {"cores": os.cpu_count(), "threads": args.threads, "rounds": args.rounds, "python": platform.python_version()}
     return {**about, "versions": versions, "tables": {}}
 
 

@@ -24,9 +24,10 @@ import pandas as pd
 from scipy.stats import t as student
 from scipy.stats import ttest_ind
 
+from experiments import markdown
 from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
-from sb3_eqr.benchmark.scores import evaluation_curve
+from sb3_eqr.benchmark.scores import evaluation_curve, normalised
 from sb3_eqr.plot_style import looks, styled
 
 Row = dict[str, Any]
@@ -50,20 +51,13 @@ def series(row: Row, what: str) -> tuple[np.ndarray, np.ndarray]:
     return edges[1:], table.groupby(pd.cut(table["step"], edges), observed=False)[what].mean().to_numpy()
 
 
-def goal_steps(row: Row) -> np.ndarray:
+def goals(row: Row) -> list[int]:
     """:return: steps at which an episode ended with a positive return"""
-    return np.array(row["training"]["step"])[np.array(row["training"]["score"]) > 0]
+    return [step for step, score in zip(row["training"]["step"], row["training"]["score"], strict=True) if score > 0]
 
 
-def first_at(row: Row, level: float) -> float:
-    """:return: the step of the first evaluation of at least ``level``"""
-    steps, scores = evaluation_curve(row)
-    return next((step for step, score in zip(steps, scores, strict=True) if score >= level), np.nan)
-
-
-def skill(row: Row, last: bool) -> float:
-    """:return: the latent model's skill at the end of training, as LatentCallback logged it, one or M steps ahead"""
-    key = "latent/skill_last" if last else "latent/skill"
+def last(row: Row, key: str) -> float:
+    """:return: the last value that was logged under a key"""
     return next((logged[key] for logged in reversed(row["losses"]) if key in logged), np.nan)
 
 
@@ -71,10 +65,10 @@ MEASURES: dict[str, Callable[[Row], float]] = {
     "score": lambda row: evaluation_curve(row)[1][-1],
     "end": lambda row: series(row, "return")[1][-1],  # return in training, in the last tenth
     "return": lambda row: np.mean(row["training"]["score"]),
-    "goals": lambda row: len(goal_steps(row)),
-    "first_goal": lambda row: min(goal_steps(row), default=np.nan),
-    "skill": lambda row: skill(row, last=False),
-    "skill_last": lambda row: skill(row, last=True),
+    "goals": lambda row: len(goals(row)),
+    "first_goal": lambda row: min(goals(row), default=np.nan),
+    "skill": lambda row: last(row, "latent/skill"),  # of the latent model one step ahead, as LatentCallback logged it
+    "skill_last": lambda row: last(row, "latent/skill_last"),  # the same M steps ahead
     "R2": lambda row: np.nan,  # of the true state from the trunk's features, measured after training (experiments.probes)
     "minutes": lambda row: row["wall_clock_s"] / 60,
 }
@@ -90,13 +84,15 @@ def measure(row: Row, name: str) -> float:
         return float(row["measures"][name])
     if name in MEASURES:
         return float(MEASURES[name](row))
-    if name.startswith("at"):
-        return first_at(row, float(name[2:]))
     if name.startswith("train/"):
-        return float(next((logged[name[6:]] for logged in reversed(row["losses"]) if name[6:] in logged), np.nan))
-    first, last = map(int, name.split("-"))
-    found = [s for step, s in zip(row["training"]["step"], row["training"]["score"], strict=True) if first < step <= last]
-    return float(np.mean(found)) if found and row.get("stopped_at", last) >= last else np.nan
+        return float(last(row, name[6:]))
+    if name.startswith("at"):
+        steps, scores = evaluation_curve(row)
+        return float(min(steps[scores >= float(name[2:])], default=np.nan))
+    first, end = map(int, name.split("-"))
+    steps, scores = np.array(row["training"]["step"]), np.array(row["training"]["score"])
+    found = scores[(first < steps) & (steps <= end)]
+    return float(np.mean(found)) if len(found) and row.get("stopped_at", end) >= end else np.nan
 
 
 def text(value: float) -> str:
@@ -139,10 +135,9 @@ def ratio(changed: np.ndarray, entry: np.ndarray) -> tuple[float, float, float]:
     return float(ratios.mean()), float(ratios.mean() - half), float(ratios.mean() + half)
 
 
-def values_of(rows: list[Row], agent: str, game: str, name: str) -> dict[int, float]:
-    """:return: seed -> value of a measure, for the runs that have it"""
-    found = {row["seed"]: measure(row, name) for row in rows if (row["agent"], row["game"]) == (agent, game)}
-    return {seed: value for seed, value in sorted(found.items()) if not np.isnan(value)}
+def unique(rows: list[Row], key: str) -> list[str]:
+    """:return: the values of a key in order of appearance"""
+    return list(dict.fromkeys(row[key] for row in rows))
 
 
 def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: bool = False, each: bool = False) -> str:
@@ -151,27 +146,25 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
     :param baseline: the agent that the others are compared with
     :return: Markdown, a row per agent, a column per measure and game
     """
-    games, agents = (list(dict.fromkeys(row[key] for row in rows)) for key in ("game", "agent"))
+    games, ratios = unique(rows, "game"), measures if is_ratio else []
     columns = [(game, name) for name in measures for game in games]
-    header = [*(f"{game}, {name}" for game, name in columns), *(f"{name}, relative" for name in measures if is_ratio)]
-    lines = [f"| agent | seeds | {' | '.join(header)} |", "|---" * (len(header) + 2) + "|"]
-    for agent in agents:
-        cells = []
+    header = ["agent", "seeds", *(f"{game}, {name}" for game, name in columns), *(f"{name}, relative" for name in ratios)]
+    found = [[row["agent"], row["game"], row["seed"], *(measure(row, name) for name in measures)] for row in rows]
+    frame = pd.DataFrame(found, columns=["agent", "game", "seed", *measures]).sort_values("seed")
+    by_agent, lines = dict(list(frame.groupby("agent"))), []
+    for agent in unique(rows, "agent"):
+        own, other, cells = by_agent[agent], by_agent.get(baseline, frame[:0]), []
         for game, name in columns:
-            values = list(values_of(rows, agent, game, name).values())
-            cell = ", ".join(map(text, values)) if each else mean_and_error(np.array(values))
-            if baseline not in (None, agent) and not is_ratio:
-                cell += difference(np.array(values), np.array(list(values_of(rows, str(baseline), game, name).values())))
-            cells.append(cell)
-        for name in measures if is_ratio else []:
-            both = [[values_of(rows, one, game, name) for game in games] for one in (agent, str(baseline))]
-            seeds = [sorted(set.intersection(*map(set, found))) for found in both]
-            matrices = [np.array([[v[s] for v in found] for s in own]) for found, own in zip(both, seeds, strict=True)]
-            has_all = agent != baseline and min(map(len, matrices)) > 0
-            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*ratio(*matrices)) if has_all else "")
-        n_seeds = len({row["seed"] for row in rows if row["agent"] == agent})
-        lines.append(f"| {agent} | {n_seeds} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            values, others = (part.loc[part["game"] == game, name].dropna().to_numpy() for part in (own, other))
+            shown = ", ".join(map(text, values)) if each else mean_and_error(values)
+            cells.append(shown + (difference(values, others) if not is_ratio and agent != baseline else ""))
+        for name in ratios:
+            both = [part.pivot(index="seed", columns="game", values=name).reindex(columns=games) for part in (own, other)]
+            matrices = [part.dropna().to_numpy() for part in both]  # of the seeds that have it on all games
+            is_compared = agent != baseline and min(map(len, matrices)) > 0
+            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*ratio(*matrices)) if is_compared else "")
+        lines.append([agent, str(own["seed"].nunique()), *cells])
+    return markdown(header, lines)
 
 
 def draw(rows: list[Row], what: str, path: pathlib.Path) -> None:
@@ -180,7 +173,7 @@ def draw(rows: list[Row], what: str, path: pathlib.Path) -> None:
 
     :param what: see :func:`series`
     """
-    games, agents = (list(dict.fromkeys(row[key] for row in rows)) for key in ("game", "agent"))
+    games, agents = unique(rows, "game"), unique(rows, "agent")
     with styled():
         figure, axes = plt.subplots(1, len(games), figsize=(4 * len(games), 3.2), layout="constrained", squeeze=False)
         for axis, game in zip(axes[0], games, strict=True):
@@ -200,12 +193,12 @@ def draw(rows: list[Row], what: str, path: pathlib.Path) -> None:
 def published() -> str:
     """:return: Markdown: the last rows of the EqR paper's tables, computed from the scores of games in them"""
     scores = load_reference().pivot(index="game", columns="method", values="mean")
-    lines = ["| table | method | mean | median | superhuman games |", "|---" * 5 + "|"]
+    rows = []
     for method in sorted((name for name in scores if "[EqR Tab" in name), key=lambda name: (name[-2], name)):
-        found = ((scores[method] - scores[RANDOM]) / (scores[HUMAN] - scores[RANDOM])).dropna()
-        name = method.partition(" [")[0].replace("$", "")
-        lines.append(f"| {method[-2]} | {name} | {found.mean():.3f} | {found.median():.3f} | {(found > 1).sum()} |")
-    return "\n".join(lines)
+        found = normalised(scores[method], (scores[RANDOM], scores[HUMAN])).dropna()
+        name, number = method.partition(" [")[0].replace("$", ""), (found > 1).sum()
+        rows.append([method[-2], name, f"{found.mean():.3f}", f"{found.median():.3f}", str(number)])
+    return markdown(["table", "method", "mean", "median", "superhuman games"], rows)
 
 
 def main() -> None:
@@ -215,29 +208,26 @@ def main() -> None:
     parser.add_argument("--agents", nargs="+", help="with or without their algorithm (default: all)")
     parser.add_argument("--games", nargs="+", help="default: all")
     parser.add_argument("--seeds", nargs="+", type=int, help="default: all")
-    parser.add_argument(
-        "--measures", nargs="+", default=["score", "end", "minutes"], help=f"{', '.join(MEASURES)}, 0-20000, ..."
-    )
+    usual, known = ["score", "end", "minutes"], ", ".join(MEASURES)
+    parser.add_argument("--measures", nargs="+", default=usual, help=f"{known}, 0-20000, at475, train/aet_loss, ...")
     parser.add_argument("--baseline", help="the agent that the others are compared with")
     parser.add_argument("--ratio", action="store_true", help="compare by ratios, averaged over games")
     parser.add_argument("--each", action="store_true", help="print the seeds")
-    parser.add_argument(
-        "--figure", nargs=2, metavar=("SERIES", "FILE"), help="draw return, goals, aet_loss, ... along training"
-    )
+    drawn = "draw return, goals, aet_loss, ... along training"
+    parser.add_argument("--figure", nargs=2, metavar=("SERIES", "FILE"), help=drawn)
     parser.add_argument("--published", action="store_true", help="print the last rows of the paper's tables")
     args = parser.parse_args()
     if args.published:
         print(published())
         return
     rows = [row for file in args.files for row in read(file)[1]]
-    full = {name: agent for agent in dict.fromkeys(row["agent"] for row in rows) for name in (agent, agent.partition(":")[2])}
-    wanted = None if args.agents is None else [full.get(name, name) for name in args.agents]
-    rows = [row for row in rows if wanted is None or row["agent"] in wanted]
-    rows = [row for row in rows if args.games is None or row["game"] in args.games]
-    rows = [row for row in rows if args.seeds is None or row["seed"] in args.seeds]
+    full = {name: agent for agent in unique(rows, "agent") for name in (agent, agent.partition(":")[2])}
+    wanted = [full.get(name, name) for name in args.agents or full]
+    for key, chosen in (("agent", wanted), ("game", args.games), ("seed", args.seeds)):
+        rows = [row for row in rows if chosen is None or row[key] in chosen]
     if not rows:
         parser.error(f"no run of these agents, games and seeds; agents are {', '.join(sorted(set(full.values())))}")
-    if wanted is not None:
+    if args.agents:
         rows.sort(key=lambda row: wanted.index(row["agent"]))
     if args.figure:
         draw(rows, args.figure[0], pathlib.Path(args.figure[1]))

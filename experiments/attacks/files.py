@@ -17,6 +17,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,14 +25,16 @@ import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 
-from experiments.attacks import Finding
-from experiments.attacks.inputs import make
+from experiments.attacks import Finding, are_equal, make, partial_files
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.training import load_checkpoint
 from sb3_eqr.common.saving.checkpoints import MANIFEST, checksum_of, digest, find_checkpoints
 from sb3_eqr.visualize.loading import load_model, make_env
 
 RAN = pathlib.Path("ran")  # the file that hostile code creates
+Load = Callable[[pathlib.Path], Any]
+Members = dict[str, bytes | None]  # of a zip file; None: three gigabytes of zeros, in three megabytes
+Hostile = Iterator[tuple[str, str, pathlib.Path]]  # what the file is, its kind, its path
 
 
 class Runs:
@@ -41,8 +44,49 @@ class Runs:
         return pathlib.Path.touch, (RAN,)
 
 
+EVIL = pickle.dumps(Runs())
+PICKLE = {":kind:": "pickle", "type": "x", "pickle": base64.b64encode(EVIL).decode()}
+POPEN = {":kind:": "class", "module": "subprocess", "name": "Popen"}
+FORMS = {
+    "SB3's form": {":type:": "x", ":serialized:": PICKLE["pickle"]},
+    "our form": PICKLE,
+    "a class of another package": POPEN,
+}
+DEEP = '{"a":' * 10**6
+# Changes of a model's data: environments to import, huge networks.
+POLICY_KWARGS: dict[str, dict[str, Any]] = {
+    "groups": {"group": " x ".join(["SE(2)"] * 100_000)},
+    "a group of many blocks": {"group": "SE(2)^1000000000"},
+    "blocks": {"n_blocks": 10**9},
+    "layers": {"net_arch": [10**5, 10**5]},
+    "a wide latent model": {"latent_hidden_dim": 10**6},
+}
+MODELS: dict[str, dict[str, Any]] = {
+    **{
+        f"{place} in {form}": {place: FORMS[form]} for form in FORMS for place in ("policy_class", "policy_kwargs", "anything")
+    },
+    **{f"{name} in policy_kwargs": {"policy_kwargs": value} for name, value in POLICY_KWARGS.items()},
+    "env": {"env": "trap_module:CartPole-v1"},
+    "a huge buffer": {"buffer_size": 10**13},
+}
+# Changes of a buffer's state: pickles, numbers that are out of range, sizes that the file does not have.
+BUFFERS: dict[str, dict[str, Any]] = {
+    "a pickle": {"rewards": PICKLE},
+    "a pickle as number": {"pos": PICKLE},
+    "a position": {"pos": 10**9},
+    "a size": {"buffer_size": 10**12},
+    "a shape": {"rewards": {"dtype": "<f4", "shape": [10**12, 1]}},
+    "a dtype": {"rewards": {"dtype": "|O", "shape": [500, 1]}},
+    "another number of environments": {"n_envs": 10**6},
+    "a discount": {"gamma": float("nan")},
+}
+WALK: dict[str, Any] = {"__globals__": {"sys": {"modules": {"os": {"system": "touch ran"}}}}}
+ATTRIBUTES = ("step", "reset", "render", "__class__", "__dict__", "unwrapped", "spec", "state", "np_random")
+
+
 def trained(folder: pathlib.Path) -> Any:
-    """Train an agent, and write its model, buffer and checkpoints into a folder."""
+    """Train an agent, and write its model, buffer and checkpoints into a new folder."""
+    folder.mkdir(parents=True)
     model = make(env=make_vec_env("CartPole-v1"), seed=0)
     model.learn(120, ExactCheckpointCallback(50, folder / "checkpoints"))
     model.save(folder / "model")
@@ -50,92 +94,48 @@ def trained(folder: pathlib.Path) -> Any:
     return model
 
 
-def repacked(source: pathlib.Path, path: pathlib.Path, changes: dict[str, bytes]) -> pathlib.Path:
+def repacked(source: pathlib.Path, path: pathlib.Path, changes: Members) -> pathlib.Path:
     """Copy a zip file, replacing the contents of some members."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(path, "w") as copy:
-        for name in archive.namelist():
-            copy.writestr(name, changes.get(name, archive.read(name)))
-    return path
-
-
-def hostile(folder: pathlib.Path) -> Iterator[tuple[str, str, pathlib.Path]]:
-    """Write the hostile files; yields name, kind and path of each."""
-    evil, model = pickle.dumps(Runs()), folder / "model.zip"
-    text = base64.b64encode(evil).decode()
-    with zipfile.ZipFile(model) as archive:
-        data = json.loads(archive.read("data"))
-    forms = {
-        "SB3's form": {":type:": "x", ":serialized:": text},
-        "our form": {":kind:": "pickle", "type": "x", "pickle": text},
-    }
-    forms["a class of another package"] = {":kind:": "class", "module": "subprocess", "name": "Popen"}
-    for form, value in forms.items():
-        for place in ("policy_class", "policy_kwargs", "anything"):
-            changed = json.dumps({**data, place: value}).encode()
-            yield f"{place} in {form}", "model", repacked(model, folder / f"{form}_{place}.zip", {"data": changed})
-    for member in ("policy.pth", "policy.optimizer.pth", "pytorch_variables.pth"):
-        yield f"a pickle as {member}", "model", repacked(model, folder / f"{member}.zip", {member: evil})
-    pickled = folder / "pickled.pkl"
-    pickled.write_bytes(evil)
-    yield "a pickle as buffer", "buffer", pickled
-    objects = folder / "objects.pkl"
-    with open(objects, "wb") as file:
-        np.savez(file, data=np.array([Runs()], dtype=object))
-    yield "an array of objects as buffer", "buffer", objects
-    pickle_of = {":kind:": "pickle", "type": "x", "pickle": text}
-    yield from forged_buffers(folder, pickle_of)
-    yield from forged_checkpoints(folder, pickle_of)
-    yield from forged_models(folder, data)
-    copy = copied_checkpoint(folder, "hostile_model")
-    repacked(model, copy / "model.zip", {"policy.pth": evil})
-    yield "a checkpoint with a hostile model", "checkpoint", copy
-    beside = f"!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [{RAN.resolve()}]]"
-    for name in ("args.yml", "config.yml", "vecnormalize.pkl"):
-        run = folder / f"zoo_{name}"
-        (run / "Env").mkdir(parents=True)
-        shutil.copy(model, run / "model.zip")
-        (run / "Env" / "args.yml").write_text(yaml.dump({"env": "CartPole-v1", "env_kwargs": None, "gym_packages": []}))
-        (run / "Env" / "config.yml").write_text(yaml.dump({"policy": "MlpPolicy", "normalize": name.endswith("pkl")}))
-        content = evil if name.endswith("pkl") else f"a: {beside}\nenv: CartPole-v1\n".encode()
-        (run / "Env" / name).write_bytes(content)
-        yield f"{name} of RL Zoo", "shown", run / "model.zip"
-
-
-def forged_buffers(folder: pathlib.Path, pickle_of: dict[str, str]) -> Iterator[tuple[str, str, pathlib.Path]]:
-    """Buffers with pickles, with numbers that are out of range, and with sizes that the file does not have."""
-    source = folder / "buffer.pkl"
-    with zipfile.ZipFile(source) as archive:
-        whole = json.loads(archive.read("data"))
-    shape = whole["state"]["rewards"]["shape"]
-    changes: dict[str, Any] = {
-        "a pickle": {"rewards": pickle_of},
-        "a pickle as number": {"pos": pickle_of},
-        "a position": {"pos": 10**9},
-        "a size": {"buffer_size": 10**12},
-        "a shape": {"rewards": {"dtype": "<f4", "shape": [10**12, 1]}},
-        "a dtype": {"rewards": {"dtype": "|O", "shape": shape}},
-        "another number of environments": {"n_envs": 10**6},
-        "a discount": {"gamma": float("nan")},
-    }
-    for name, change in changes.items():
-        changed = json.dumps({**whole, "state": {**whole["state"], **change}}).encode()
-        yield f"{name} in a buffer", "buffer", repacked(source, folder / f"buffer_{name}.pkl", {"data": changed})
-    yield "a compressed buffer", "buffer", bomb(source, folder / "compressed.pkl", "rewards")
-
-
-def bomb(source: pathlib.Path, path: pathlib.Path, member: str) -> pathlib.Path:
-    """Copy a zip file with one member replaced by three gigabytes of zeros, in three megabytes."""
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(path, "w", compresslevel=1) as copy:
         for name in archive.namelist():
-            if name != member:
-                copy.writestr(name, archive.read(name))
-        info = zipfile.ZipInfo(member)
-        info.compress_type = zipfile.ZIP_DEFLATED
-        with copy.open(info, "w", force_zip64=True) as file:
-            for _ in range(3 << 10):
-                file.write(bytes(1 << 20))
+            content = changes.get(name, archive.read(name))
+            if content is not None:
+                copy.writestr(name, content)
+                continue
+            info = zipfile.ZipInfo(name)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with copy.open(info, "w", force_zip64=True) as file:
+                for _ in range(3 << 10):
+                    file.write(bytes(1 << 20))
     return path
+
+
+def forged_models(source: pathlib.Path) -> Iterator[tuple[str, Members]]:
+    """Models with pickles, of a size that they do not have, or with moments that do not fit."""
+    with zipfile.ZipFile(source) as archive:
+        data = json.loads(archive.read("data"))
+        optimizer = th.load(io.BytesIO(archive.read("policy.optimizer.pth")), weights_only=True)
+    for name, change in MODELS.items():
+        yield name, {"data": json.dumps({**data, **change}).encode()}
+    for member in ("policy.pth", "policy.optimizer.pth", "pytorch_variables.pth"):
+        yield f"a pickle as {member}", {member: EVIL}
+    yield "deep JSON in a model", {"data": f'{{"policy_kwargs":{DEEP}'.encode()}
+    for member in ("data", "policy.pth"):
+        yield f"a compressed {member}", {member: None}
+    for shape in ((1,), (0,), (10_000,)):
+        optimizer["state"][0]["exp_avg"] = th.zeros(shape)
+        content = io.BytesIO()
+        th.save(optimizer, content)
+        yield f"moments of shape {shape}", {"policy.optimizer.pth": content.getvalue()}
+
+
+def forged_buffers(source: pathlib.Path) -> Iterator[tuple[str, Members]]:
+    """Buffers with the changes of the table, and one with compressed zeros."""
+    with zipfile.ZipFile(source) as archive:
+        whole = json.loads(archive.read("data"))
+    for name, change in BUFFERS.items():
+        yield f"{name} in a buffer", {"data": json.dumps({**whole, "state": {**whole["state"], **change}}).encode()}
+    yield "a compressed buffer", {"rewards": None}
 
 
 def copied_checkpoint(folder: pathlib.Path, name: str, **changes: Any) -> pathlib.Path:
@@ -149,66 +149,65 @@ def copied_checkpoint(folder: pathlib.Path, name: str, **changes: Any) -> pathli
     return copy
 
 
-def forged_checkpoints(folder: pathlib.Path, pickle_of: dict[str, str]) -> Iterator[tuple[str, str, pathlib.Path]]:
-    """Checkpoints whose manifest names methods, generators out of range or pickles, and one with a pipe as a file."""
+def forged_checkpoints(folder: pathlib.Path) -> Iterator[tuple[str, pathlib.Path]]:
+    """Checkpoints whose manifest names methods, generators out of range or pickles; hostile JSON, pipe and model."""
     whole = json.loads((find_checkpoints(folder / "checkpoints")[-1] / MANIFEST).read_text())
-    walk: dict[str, Any] = {"__globals__": {"sys": {"modules": {"os": {"system": "touch ran"}}}}}
-    for name in ("step", "reset", "render", "__class__", "__dict__", "unwrapped", "spec", "state", "np_random"):
-        for value in (walk, pickle_of, {":kind:": "class", "module": "subprocess", "name": "Popen"}):
+    for name in ATTRIBUTES:
+        for number, value in enumerate((WALK, PICKLE, POPEN)):
             state = json.loads(json.dumps(whole["environment"]))
             for layer in state["envs"][0]:
                 layer[1][name] = value
-            copy = copied_checkpoint(folder, f"walk_{name}_{len(json.dumps(value))}", environment=state)
-            yield f"{name} in an environment's state", "checkpoint", copy
-    rng = {
-        **whole["rng"],
-        "numpy": {":kind:": "tuple", "items": ["MT19937", whole["rng"]["numpy"]["items"][1], 10**6, 0, 0.0]},
-    }
-    yield "a generator beyond its array", "checkpoint", copied_checkpoint(folder, "rng", rng=rng)
-    yield "a pickle as generator", "checkpoint", copied_checkpoint(folder, "rng_pickle", rng=pickle_of)
-    deep = copied_checkpoint(folder, "deep")
-    (deep / MANIFEST).write_text('{"a":' * 10**6)
-    yield "deep JSON", "checkpoint", deep
-    pipe = copied_checkpoint(folder, "pipe")
+            copy = copied_checkpoint(folder, f"walk_{name}_{number}", environment=state)
+            yield f"{name} in an environment's state", copy
+    items = ["MT19937", whole["rng"]["numpy"]["items"][1], 10**6, 0, 0.0]
+    rng = {**whole["rng"], "numpy": {":kind:": "tuple", "items": items}}
+    yield "a generator beyond its array", copied_checkpoint(folder, "rng", rng=rng)
+    yield "a pickle as generator", copied_checkpoint(folder, "rng_pickle", rng=PICKLE)
+    deep, pipe, other = (copied_checkpoint(folder, name) for name in ("deep", "pipe", "hostile_model"))
+    (deep / MANIFEST).write_text(DEEP)
+    yield "deep JSON", deep
     (pipe / "model.zip").unlink()
     os.mkfifo(pipe / "model.zip")
-    yield "a pipe as model", "checkpoint", pipe
+    yield "a pipe as model", pipe
+    repacked(folder / "model.zip", other / "model.zip", {"policy.pth": EVIL})
+    yield "a checkpoint with a hostile model", other
 
 
-def forged_models(folder: pathlib.Path, data: dict[str, Any]) -> Iterator[tuple[str, str, pathlib.Path]]:
-    """Models that name an environment to import, describe huge networks, or have moments that do not fit."""
-    model = folder / "model.zip"
+def forged_folders(folder: pathlib.Path) -> Iterator[tuple[str, pathlib.Path]]:
+    """Models with the files of RL Zoo, one of which runs code."""
+    touch = f"!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [{RAN.resolve()}]]"
+    for name in ("args.yml", "config.yml", "vecnormalize.pkl"):
+        run, is_pickle = folder / f"zoo_{name}", name.endswith("pkl")
+        (run / "Env").mkdir(parents=True)
+        shutil.copy(folder / "model.zip", run / "model.zip")
+        (run / "Env" / "args.yml").write_text(yaml.dump({"env": "CartPole-v1", "env_kwargs": None, "gym_packages": []}))
+        (run / "Env" / "config.yml").write_text(yaml.dump({"policy": "MlpPolicy", "normalize": is_pickle}))
+        (run / "Env" / name).write_bytes(EVIL if is_pickle else f"a: {touch}\nenv: CartPole-v1\n".encode())
+        yield f"{name} of RL Zoo", run / "model.zip"
+
+
+def hostile(folder: pathlib.Path) -> Hostile:
+    """Write the hostile files beside the model, buffer and checkpoints of :func:`trained`."""
     (folder / "trap_module.py").write_text(f"import pathlib\npathlib.Path({str(RAN.resolve())!r}).touch()\n")
     sys.path.append(str(folder))
-    kwargs: dict[str, Any] = {
-        "groups": {"group": " x ".join(["SE(2)"] * 100_000)},
-        "a group of many blocks": {"group": "SE(2)^1000000000"},
-        "blocks": {"n_blocks": 10**9},
-        "layers": {"net_arch": [10**5, 10**5]},
-        "a wide latent model": {"latent_hidden_dim": 10**6},
-    }
-    changes = {f"{name} in policy_kwargs": {"policy_kwargs": value} for name, value in kwargs.items()}
-    changes |= {"env": {"env": "trap_module:CartPole-v1"}, "a huge buffer": {"buffer_size": 10**13}}
-    for name, change in changes.items():
-        yield name, "model", repacked(model, folder / f"{name}.zip", {"data": json.dumps({**data, **change}).encode()})
-    deep = ('{"policy_kwargs":' + '{"a":' * 10**6).encode()
-    yield "deep JSON in a model", "model", repacked(model, folder / "deep_data.zip", {"data": deep})
-    for member in ("data", "policy.pth"):
-        yield f"a compressed {member}", "model", bomb(model, folder / f"bomb_{member}.zip", member)
-    with zipfile.ZipFile(model) as archive:
-        optimizer = th.load(io.BytesIO(archive.read("policy.optimizer.pth")), weights_only=True)
-    for shape in ((1,), (0,), (10_000,)):
-        optimizer["state"][0]["exp_avg"] = th.zeros(shape)
-        content = io.BytesIO()
-        th.save(optimizer, content)
-        changed = {"policy.optimizer.pth": content.getvalue()}
-        yield f"moments of shape {shape}", "model", repacked(model, folder / f"moments_{shape}.zip", changed)
+    model, buffer = folder / "model.zip", folder / "buffer.pkl"
+    for name, members in forged_models(model):
+        yield name, "model", repacked(model, folder / f"{name}.zip", members)
+    for name, members in forged_buffers(buffer):
+        yield name, "buffer", repacked(buffer, folder / f"{name}.pkl", members)
+    pickled, objects = folder / "pickled.pkl", io.BytesIO()
+    pickled.write_bytes(EVIL)
+    yield "a pickle as buffer", "buffer", pickled
+    np.savez(objects, data=np.array([Runs()], dtype=object))
+    (folder / "objects.pkl").write_bytes(objects.getvalue())
+    yield "an array of objects as buffer", "buffer", folder / "objects.pkl"
+    yield from ((name, "checkpoint", path) for name, path in forged_checkpoints(folder))
+    yield from ((name, "shown", path) for name, path in forged_folders(folder))
 
 
-def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], Any]]]:
+def load_paths() -> dict[str, list[Load]]:
     """All functions that load a file, by kind of file."""
-    model, env = make(), make_vec_env("CartPole-v1")
-    into_run = make(env=make_vec_env("CartPole-v1"))
+    model, into_run, env = make(), make(env=make_vec_env("CartPole-v1")), make_vec_env("CartPole-v1")
     return {
         "model": [
             EqRQRDQN.load,
@@ -226,16 +225,14 @@ def load_paths(folder: pathlib.Path) -> dict[str, list[Callable[[pathlib.Path], 
     }
 
 
-def trusting(kind: str) -> Callable[[pathlib.Path], Any]:
-    """A function that loads a file with ``trust=True``."""
-    if kind == "buffer":
-        return lambda path: make().load_replay_buffer(path, trust=True)
-    if kind == "shown":
-        return lambda path: make_env(load_model(path), path, trust=True)
-    return lambda path: EqRQRDQN.load(path, trust=True)
+TRUSTING: dict[str, Load] = {
+    "model": lambda path: EqRQRDQN.load(path, trust=True),
+    "buffer": lambda path: make().load_replay_buffer(path, trust=True),
+    "shown": lambda path: make_env(load_model(path), path, trust=True),
+}
 
 
-def runs_code(load: Callable[[pathlib.Path], Any], path: pathlib.Path) -> bool:
+def runs_code(load: Load, path: pathlib.Path) -> bool:
     """Whether loading a file, which may fail, runs the code that it names."""
     with contextlib.suppress(Exception), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -247,37 +244,30 @@ def runs_code(load: Callable[[pathlib.Path], Any], path: pathlib.Path) -> bool:
 
 def strangers_files(folder: pathlib.Path) -> Finding:
     """Load each hostile file with each function for its kind."""
-    folder.mkdir(parents=True)
     trained(folder)
-    ways, wrong, tries, alive = load_paths(folder), [], 0, 0
+    ways, wrong, seconds = load_paths(), [], []
     files = list(hostile(folder))
-    slowest, before = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for name, kind, path in files:
         for number, load in enumerate(ways[kind]):
-            tries += 1
             began = time.monotonic()
-            if runs_code(load, path):
-                wrong.append(f"{name}, way {number}: ran code")
-            seconds = time.monotonic() - began
-            slowest = max(slowest, seconds)
-            if seconds > 10:
-                wrong.append(f"{name}, way {number}: {seconds:.0f} seconds")
+            wrong += [f"{name}, way {number}: ran code"] if runs_code(load, path) else []
+            seconds.append(time.monotonic() - began)
+            wrong += [f"{name}, way {number}: {seconds[-1]:.0f} seconds"] if seconds[-1] > 10 else []
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # GB
-    if most > 2:
-        wrong.append(f"{most:.1f} GB, {before / 2**20:.1f} before")
-    tries += 200
-    if swapped(folder, 200):
+    wrong += [f"{most:.1f} GB"] if most > 2 else []
+    n_swapped = 200
+    if swapped(folder, n_swapped):
         wrong.append("a file that is replaced while it is loaded: ran code")
-    for _, kind, path in files:  # with trust=True they must run code, else they would prove nothing
-        alive += runs_code(trusting(kind), path)
-    test = f"{len(files)} hostile files, {tries} loads"
-    found = f"{len(wrong)} did, {alive} ran code with trust; {slowest:.1f} s, {most:.1f} GB at most"
-    return Finding(test, "0 run code without trust=True, or take 10 s or 2 GB", found, not wrong and alive > 0, tuple(wrong))
+    alive = sum(runs_code(TRUSTING[kind], path) for _, kind, path in files if kind in TRUSTING)
+    found = f"{len(wrong)} did, {alive} ran code with trust; {max(seconds):.1f} s, {most:.1f} GB at most"
+    wrong += [] if alive else ["none ran code with trust=True, so they prove nothing"]
+    test = f"{len(files)} hostile files, {len(seconds) + n_swapped} loads"
+    return Finding(test, "0 run code without trust=True, or take 10 s or 2 GB", found, wrong)
 
 
 def swapped(folder: pathlib.Path, times: int) -> bool:
     """Whether loading a file that another thread replaces by a hostile one runs code."""
-    good, evil = (folder / "model.zip").read_bytes(), (folder / "policy.pth.zip").read_bytes()
+    good, evil = (folder / "model.zip").read_bytes(), (folder / "a pickle as policy.pth.zip").read_bytes()
     path, is_over = folder / "swapped.zip", threading.Event()
 
     def swap() -> None:
@@ -297,7 +287,6 @@ def swapped(folder: pathlib.Path, times: int) -> bool:
 
 def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
     """Truncate each kind of file at 20 places and flip a bit at 20; loading must fail and leave the agent unchanged."""
-    folder.mkdir(parents=True)
     model = trained(folder)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     size, env = model.replay_buffer.size(), model.get_env()
@@ -316,31 +305,27 @@ def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
             changed[place] ^= 1 << rng.randrange(8)
             path.write_bytes(whole[:place] if kind == "truncated" else bytes(changed))
             count += 1
+            what = f"{path.name}, {kind} at {place}"
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
                     load()
-                wrong.append(f"{path.name}, {kind} at {place}: loaded")
+                wrong.append(f"{what}: loaded")
             except Exception as error:
-                if not str(error):
-                    wrong.append(f"{path.name}, {kind} at {place}: {type(error).__name__} without a message")
+                wrong += [] if str(error) else [f"{what}: {type(error).__name__} without a message"]
             path.write_bytes(whole)
-            is_same = all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
-            if not is_same or model.replay_buffer.size() != size:
-                wrong.append(f"{path.name}, {kind} at {place}: the agent has changed")
-    must = "every one rejected, the model unchanged"
-    return Finding(
-        f"{count} damaged files of {len(loads)} kinds", must, f"{count - len(wrong)} rejected", not wrong, tuple(wrong)
-    )
+            if not are_equal(before, model.policy.state_dict()) or model.replay_buffer.size() != size:
+                wrong.append(f"{what}: the agent has changed")
+    test = f"{count} damaged files of {len(loads)} kinds"
+    return Finding(test, "every one rejected, the model unchanged", f"{count - len(wrong)} rejected", wrong)
 
 
 def shared_path(folder: pathlib.Path) -> Finding:
     """Save to one path and load from it in several threads."""
     folder.mkdir(parents=True)
-    model = make()
-    model.save(folder / "model")
-    model.save_replay_buffer(folder / "buffer")
+    model, buffer = folder / "model", folder / "buffer"
+    make().save(model)
+    make().save_replay_buffer(buffer)
     wrong: list[str] = []
-    counts = {"saves": 0, "loads": 0}
 
     def repeat(kind: str, times: int, call: Callable[[], Any]) -> None:
         for _ in range(times):
@@ -348,33 +333,22 @@ def shared_path(folder: pathlib.Path) -> Finding:
                 call()
             except Exception as error:
                 wrong.append(f"{kind}: {type(error).__name__}: {error}")
-            counts[kind] += 1
 
-    savers = [make(seed=seed) for seed in range(4)]
-    threads = [threading.Thread(target=repeat, args=("saves", 24, lambda m=m: m.save(folder / "model"))) for m in savers]
-    threads += [
-        threading.Thread(target=repeat, args=("saves", 24, lambda m=m: m.save_replay_buffer(folder / "buffer")))
-        for m in savers
-    ]
-    threads += [threading.Thread(target=repeat, args=("loads", 56, lambda: EqRQRDQN.load(folder / "model"))) for _ in range(4)]
-    readers = [make() for _ in range(4)]
-    threads += [
-        threading.Thread(target=repeat, args=("loads", 56, lambda m=m: m.load_replay_buffer(folder / "buffer")))
-        for m in readers
-    ]
+    calls: list[tuple[str, int, Callable[[], Any]]] = []
+    for seed in range(4):
+        saver, reader = make(seed=seed), make()
+        calls += [("saves", 24, partial(saver.save, model)), ("saves", 24, partial(saver.save_replay_buffer, buffer))]
+        calls += [("loads", 56, partial(EqRQRDQN.load, model)), ("loads", 56, partial(reader.load_replay_buffer, buffer))]
+    threads = [threading.Thread(target=repeat, args=call) for call in calls]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    left = [str(path) for path in folder.rglob(".*")]
+    n_saves, n_loads = (sum(times for kind, times, _ in calls if kind == wanted) for wanted in ("saves", "loads"))
+    left = partial_files(folder)
     found = f"{len(wrong)} failures, {len(left)} partial files"
-    return Finding(
-        f"threads on one path: {counts['saves']} saves, {counts['loads']} loads",
-        "0 failures, 0 partial files",
-        found,
-        not wrong and not left,
-        tuple(wrong[:10] + left),
-    )
+    test = f"threads on one path: {n_saves} saves, {n_loads} loads"
+    return Finding(test, "0 failures, 0 partial files", found, wrong[:10] + left)
 
 
 def full_disk(folder: pathlib.Path) -> Finding:
@@ -383,19 +357,18 @@ def full_disk(folder: pathlib.Path) -> Finding:
     test, must = "a full disk (tmpfs of 2 MB)", "the last checkpoint is intact, and the message says so"
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)], capture_output=True)
     if mounted.returncode != 0:
-        return Finding(test, must, "cannot mount here", False)
+        return Finding(test, must, "cannot mount here", ["cannot mount here"])
+    said = ""
     try:
         model = make(env=make_vec_env("CartPole-v1"), seed=0, buffer_size=20_000)
-        said = ""
         try:
             model.learn(4_000, ExactCheckpointCallback(50, folder / "checkpoints", keep=1_000))
         except OSError as error:
             said = str(error).replace(str(folder), "FOLDER")
-        resumed = EqRQRDQN.resume(folder / "checkpoints", make_vec_env("CartPole-v1"))
-        left = [str(path) for path in folder.rglob(".*")]
-        holds = (
-            "The last checkpoint, checkpoint-0" in said and "No space left" in said and resumed.num_timesteps > 0 and not left
-        )
-        return Finding(test, must, f"{said!r}; resumed at step {resumed.num_timesteps}", holds, tuple(left))
+        step = EqRQRDQN.resume(folder / "checkpoints", make_vec_env("CartPole-v1")).num_timesteps
+        wrong = partial_files(folder)
     finally:
         subprocess.run(["umount", str(folder)], check=False)
+    wrong += [f"no {part!r}" for part in ("The last checkpoint, checkpoint-0", "No space left") if part not in said]
+    wrong += [] if step > 0 else ["resumed at step 0"]
+    return Finding(test, must, f"{said!r}; resumed at step {step}", wrong)

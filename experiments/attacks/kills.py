@@ -12,7 +12,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
-from experiments.attacks import Finding
+from experiments.attacks import Finding, are_equal, make, partial_files
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.runs import RESULT, Run, Settings, plan_runs
 from sb3_eqr.benchmark.suites import load_suite
@@ -31,9 +31,9 @@ def train(folder: pathlib.Path) -> None:
     if find_checkpoints(folder):
         model = EqRQRDQN.resume(folder, make_vec_env("CartPole-v1"))
     else:
-        small: dict[str, Any] = {"n_blocks": 2, "net_arch": [16], "latent_hidden_dim": 16}
+        networks = {"net_arch": [16], "latent_hidden_dim": 16}
         options: dict[str, Any] = {"train_freq": 8, "gradient_steps": 1, "learning_starts": 100, "buffer_size": 2_000}
-        model = EqRQRDQN("MlpPolicy", "CartPole-v1", **options, policy_kwargs=small, seed=0)
+        model = make(**options, policy_kwargs=networks, seed=0)
     left = STEPS - model.num_timesteps
     if left > 0:
         model.learn(left, ExactCheckpointCallback(SAVE_FREQ, folder), reset_num_timesteps=False)
@@ -65,17 +65,6 @@ def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at
             return strange, done
 
 
-def left_over(folder: pathlib.Path) -> list[str]:
-    """Partial files, whose names begin with a dot."""
-    return [str(path) for path in folder.rglob(".*")]
-
-
-def same_parameters(first: pathlib.Path, second: pathlib.Path) -> bool:
-    """Whether two runs ended with bit-identical parameters."""
-    one, other = (EqRQRDQN.load(folder / "final.zip").policy.state_dict() for folder in (first, second))
-    return all(th.equal(one[name], other[name]) for name in one)
-
-
 def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: int) -> Finding:
     """Compare a run that is killed repeatedly, or several at once in one folder, with an undisturbed run."""
     undisturbed, killed = folder / "undisturbed", folder / f"killed_{at_once}"
@@ -83,21 +72,22 @@ def killed_runs(folder: pathlib.Path, kills: int, rng: random.Random, at_once: i
         kill_until_done(lambda: train(undisturbed), 0, rng)
     killed.mkdir(parents=True)
     strange, done = kill_until_done(lambda: train(killed), kills, rng, at_once)
-    is_there = (killed / "final.zip").is_file()
-    is_same, partial = is_there and same_parameters(undisturbed, killed), left_over(killed)
+    bits = "lost"
+    if (killed / "final.zip").is_file():
+        states = [EqRQRDQN.load(place / "final.zip").policy.state_dict() for place in (undisturbed, killed)]
+        bits = "equal bits" if are_equal(*states) else "other bits"
+    left = partial_files(killed)
+    wrong = [*([] if bits == "equal bits" else [bits]), *left, *map(str, strange)]
+    found = f"{bits}, {len(left)} partial, {len(strange)} errors"
     name = f"{done} SIGKILLs of a run" if at_once == 1 else f"{done} SIGKILLs of {at_once} runs on one folder"
-    found = (
-        f"{'equal bits' if is_same else 'other bits' if is_there else 'lost'}, {len(partial)} partial, {len(strange)} errors"
-    )
-    holds = is_same and not partial and not strange
-    return Finding(name, "equal bits, 0 partial files, 0 errors", found, holds, tuple(map(str, [*partial, *strange])))
+    return Finding(name, "equal bits, 0 partial files, 0 errors", found, wrong)
 
 
 def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Finding:
     """Compare killed runs of the suite smoke, as Ray's workers execute them, with undisturbed ones, seed by seed."""
     suite, settings = load_suite("smoke"), Settings(checkpoint_seconds=0.2)
     agents = ["eqr_qrdqn", "eqr_rainbow", "qrdqn:stock"]
-    different: list[Any] = []
+    different: list[str] = []
     strange: list[Any] = []
     done, seeds = 0, 0
     while done < kills:
@@ -110,11 +100,11 @@ def killed_benchmark(folder: pathlib.Path, kills: int, rng: random.Random) -> Fi
                 strange, done = strange + codes, done + hits
                 expected, found = scores(undisturbed), scores(killed)
                 different += [str(killed.folder)] if found is None or found != expected else []
-    partial = left_over(folder)
-    found = f"{'other' if different else 'equal'} scores, {len(partial)} partial, {len(strange)} errors"
-    wrong = tuple(map(str, [*different, *partial, *strange]))
+    left = partial_files(folder)
+    found = f"{'other' if different else 'equal'} scores, {len(left)} partial, {len(strange)} errors"
     name = f"{done} SIGKILLs of {seeds * len(agents)} runs of the benchmark (smoke)"
-    return Finding(name, "equal scores, 0 partial files, 0 errors", found, not wrong, wrong)
+    wrong = [*different, *left, *map(str, strange)]
+    return Finding(name, "equal scores, 0 partial files, 0 errors", found, wrong)
 
 
 def scores(run: Run) -> Any:

@@ -11,7 +11,7 @@ import torch as th
 
 from experiments import speed, workload
 from experiments.clock import Series, Table, count_operations, take_turns
-from experiments.sizes import growth
+from experiments.speed import growth
 from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, bytes_per_transition, fill, make_agent
 from sb3_eqr import EqRQRDQN
 from tests.tools.test_package import ROOT
@@ -94,15 +94,15 @@ def test_a_table():
 
 def test_options():
     args = speed.parse([])
-    assert args.only == ["updates", "neighbour", "steps", "profile"] and args.network is None
-    args = speed.parse(["--only", "sizes,steps", "--network", "minatar,cartpole", "--before", str(ROOT)])
-    assert args.only == ["sizes", "steps"] and args.network == ["minatar", "cartpole"]
+    assert args.only == ["updates", "neighbour"] and args.network is None
+    args = speed.parse(["--only", "sizes,graph", "--network", "minatar,cartpole", "--before", str(ROOT)])
+    assert args.only == ["sizes", "graph"] and args.network == ["minatar", "cartpole"]
 
 
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, steps, profile, graph, sizes, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, neighbour, graph, sizes, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
         ("--largest 100", "--largest must be an integer >= 10000, got 100"),
@@ -134,13 +134,13 @@ def test_importing_another_version_together_with_this_one(monkeypatch):
 
 @pytest.mark.slow
 def test_script_prints_its_tables(tmp_path):
-    parts = ["--only", "updates,neighbour,steps,profile", "--network", "minatar", "--before", str(ROOT)]
+    parts = ["--only", "updates,neighbour", "--network", "minatar", "--before", str(ROOT)]
     command = [sys.executable, "-m", "experiments.speed", "--threads", "1", "--rounds", "1", *parts]
     done = subprocess.run([*command, "--json", tmp_path / "speed.json"], check=True, capture_output=True, text=True, cwd=ROOT)
     found = json.loads((tmp_path / "speed.json").read_text())
     assert {"command", "threads", "versions"} <= found.keys() and done.stdout.startswith(found["cpu"])
     tables = found["tables"]
-    assert list(tables) == ["updates_minatar", "neighbour", "steps_minatar", *(f"profile_{n}_minatar" for n in EQR_AGENTS)]
+    assert list(tables) == ["updates_minatar", "neighbour"]
     assert all(table["title"] in done.stdout for table in tables.values())
     operations = {row["name"]: row["operations"] for row in tables["updates_minatar"]["rows"]}
     assert (operations["DQN"], operations["QRDQN"]) == (140, 170)
