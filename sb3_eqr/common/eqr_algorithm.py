@@ -248,13 +248,13 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         if self.bfloat16_targets:
             validation.warn_of_slow_bfloat16(self.device)
         self._objective_options = self._options_of_objective()
-        self.objective = Objective(self.policy, *self._objective_options)
+        self.objective = Objective(self.policy, **self._objective_options)
         self._captured = CapturedGradients(self.objective, self._trained) if self.cuda_graph else None
 
-    def _options_of_objective(self) -> tuple[Any, ...]:
-        target_is_copied = self.tau == 1 and self.target_update_interval is None
-        options = self.double_q, self.shift_pixels, self.intensity_scale, self.aux_gradient_share, target_is_copied
-        return *options, self.bfloat16_targets
+    def _options_of_objective(self) -> dict[str, Any]:
+        names = ("double_q", "shift_pixels", "intensity_scale", "aux_gradient_share", "bfloat16_targets")
+        options = {name: getattr(self, name) for name in names}
+        return {**options, "target_is_copied": self.tau == 1 and self.target_update_interval is None}
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)

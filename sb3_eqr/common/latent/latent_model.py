@@ -118,7 +118,7 @@ class LatentModel(nn.Module):
         :param features: of s_t, online, (B, F)
         :param actions: embeddings of a_t ... a_{t+M-1}, (B, M, A)
         :param rewards: r_{t+1} ... r_{t+M}, (B, M)
-        :param mask: 1 where the episode had not ended before step t+m, (B, M)
+        :param mask: 1 where the episode had not ended before step t+m, (B, M); the step that ends it counts
         :param target: the target copy of this model
         :param target_features: of s_t from the target encoder, (B, F), for the losses in ``NEED_FEATURES``
         :param target_rollout: of s_{t+1} ... s_{t+M} from the target encoder, (B * M, F), for those in ``NEED_ROLLOUT``
@@ -169,7 +169,7 @@ class LatentModel(nn.Module):
         """p, followed by the predictor: (N, D) to (N, P)."""
         first, second = self.projection, self.predictor
         if isinstance(first, nn.Linear) and isinstance(second, nn.Linear) and len(state) > self.state_dim:
-            weight = second.weight @ first.weight  # one product for all states in place of two
+            weight = second.weight @ first.weight  # the same map by one product for all states in place of two
             return F.linear(state, weight, F.linear(first.bias, second.weight, second.bias))
         return second(first(state))
 
