@@ -224,10 +224,9 @@ def make_dopamine_spr() -> Calls:
     import_dopamine()
     sys.modules["dopamine.labs.atari_100k.replay_memory"] = MagicMock()
     import gin
-
-    gin.bind_parameter("Atari100kRainbowAgent.data_augmentation", True)
     from dopamine.labs.atari_100k.spr_agent import SPRAgent
 
+    gin.bind_parameter("Atari100kRainbowAgent.data_augmentation", True)
     agent, rng = SPRAgent(N_ACTIONS, seed=0), np.random.default_rng(0)
     shape = (BATCH_SIZE, agent._jumps + 1)
     images = {key: rng.integers(0, 256, (*shape, SIZE, SIZE, N_STACK), dtype=np.uint8) for key in ("state", "next_state")}

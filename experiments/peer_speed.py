@@ -115,7 +115,10 @@ def measure(names: list[str], folder: pathlib.Path, n_threads: int, rounds: int)
 
 
 def row_of(name: str, about: Row, rounds: list[Row], baseline: list[Row]) -> Row:
-    """Medians over the rounds. ``times_DQN``: median of the ratios within a round, of the time of an update."""
+    """
+    :return: medians over the rounds, and all rounds: seconds of wall-clock and of CPU time. ``times_DQN``: median of the
+        ratios within a round, of the time of an update
+    """
 
     def median(call: str, clock: int, factor: float) -> float | None:
         return float(np.median([one[call][clock] for one in rounds])) * factor if rounds and call in rounds[0] else None
@@ -134,7 +137,7 @@ def row_of(name: str, about: Row, rounds: list[Row], baseline: list[Row]) -> Row
     row |= {"times_DQN": float(np.median(ratios)) if ratios else None}
     row |= {"us_add": median("add", 0, 1e6), "us_sample": median("sample", 0, 1e6)}
     row |= {"bytes_per_transition": about.get("bytes_per_transition"), "steps_per_s": 1 / step if step else None}
-    return {**row, "note": about["note"]}
+    return {**row, "note": about["note"], "rounds": rounds}
 
 
 def table(rows: list[Row]) -> str:
@@ -145,10 +148,10 @@ def table(rows: list[Row]) -> str:
             return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:#.3g}"
         return "-" if value is None else str(value)
 
-    keys = [key for key in rows[0] if key != "note"]
+    keys = [key for key in rows[0] if key not in ("note", "rounds")]
     lines = [f"| {' | '.join(key.replace('_', ' ') for key in keys)} |", f"|{'---|' * len(keys)}"]
     lines += [f"| {' | '.join(cell(row[key]) for key in keys)} |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {row['name']}: {row['note']}." for row in rows if row["note"])])
+    return "\n".join([*lines, "", *(f"- {row['name']}: {row['note'].rstrip('.')}." for row in rows if row["note"])])
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
