@@ -17,7 +17,7 @@ from functools import partial
 
 import torch as th
 
-from experiments.attacks import Finding, files, inputs, kills, numbers, resumes
+from experiments.attacks import Finding, files, inputs, kills, numbers
 from experiments.attacks.command_lines import wrong_command_lines
 
 
@@ -34,7 +34,7 @@ def attacks(folder: pathlib.Path, n_kills: int, rng: random.Random) -> dict[str,
             partial(kills.killed_runs, folder / "runs", n_kills, rng, at_once=2),
             partial(kills.killed_benchmark, folder / "benchmark", n_kills, rng),
         ],
-        "resumes": [partial(resumes.resumed_runs, folder / "resumed")],
+        "resumes": [partial(kills.resumed_runs, folder / "resumed")],
         "inputs": [inputs.wrong_arguments, inputs.without_asserts, partial(wrong_command_lines, folder / "lines")],
         "numbers": [partial(numbers.not_a_number, folder / "numbers")],
         "files": [

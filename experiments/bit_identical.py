@@ -16,10 +16,10 @@ import json
 import pathlib
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
@@ -31,18 +31,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup
 
 AGENTS = {"qrdqn": EqRQRDQN, "rainbow": EqRRainbow}
-COMMON: dict[str, Any] = {
-    "learning_starts": 60,
-    "buffer_size": 150,  # small, so that old transitions are overwritten
-    "batch_size": 16,
-    "n_steps": 3,
-    "prediction_depth": 3,
-    "learning_rate": 1e-3,
-    "exploration_final_eps": 0.05,
-    "device": "cpu",
-    "seed": 7,
-}
-NETWORK = {"n_blocks": 3, "net_arch": [32], "latent_hidden_dim": 24}
 SCALES = MatrixLieGroup([[[0.0, 1.0], [-1.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]])
 
 
@@ -53,38 +41,29 @@ def make_images() -> FakeImageEnv:
     return env
 
 
-def make_env(kind: str, n_envs: int) -> VecEnv:
-    """Create environments of one kind, the same each time."""
-    np.random.seed(0)
-    if kind == "images":
-        return VecFrameStack(make_vec_env(make_images, n_envs), 4)
-    if kind == "dicts":
-        return make_vec_env(lambda: SimpleMultiObsEnv(channel_last=True), n_envs)
-    env = make_vec_env(lambda: gym.make("CartPole-v1"), n_envs)
-    return VecNormalize(env) if kind == "normalized" else env
-
-
-POLICIES = {"vectors": "MlpPolicy", "normalized": "MlpPolicy", "images": "CnnPolicy", "dicts": "MultiInputPolicy"}
-
-CONFIGURATIONS: dict[str, dict[str, Any]] = yaml.safe_load(
-    pathlib.Path(__file__).with_name("settings").joinpath("bit_identical.yml").read_text(encoding="utf-8")
-)
+ENVS: dict[str, tuple[str, Callable[[int], VecEnv]]] = {  # kind -> policy, environments of a given number
+    "vectors": ("MlpPolicy", partial(make_vec_env, "CartPole-v1")),
+    "normalized": ("MlpPolicy", lambda n: VecNormalize(make_vec_env("CartPole-v1", n))),
+    "images": ("CnnPolicy", lambda n: VecFrameStack(make_vec_env(make_images, n), 4)),
+    "dicts": ("MultiInputPolicy", partial(make_vec_env, partial(SimpleMultiObsEnv, channel_last=True))),
+}
+FILE = pathlib.Path(__file__).with_name("settings") / "bit_identical.yml"
+CONFIGURATIONS: dict[str, dict[str, Any]] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+COMMON = CONFIGURATIONS.pop("common")
 OBJECTS = {"SCALES": SCALES, "RMSprop": th.optim.RMSprop}  # by their names in the file
 
 
 def train(name: str) -> Any:
-    """
-    :param name: name of a configuration
-    :return: its agent after about 200 updates
-    """
+    """:return: the agent of a configuration after about 200 updates"""
     settings = CONFIGURATIONS[name]
-    agent, kind, n_envs = settings["agent"], settings["env"], settings.get("n_envs", 1)
+    n_envs, (policy, make_env) = settings.get("n_envs", 1), ENVS[settings["env"]]
     network = {key: OBJECTS.get(str(value), value) for key, value in settings.get("policy_kwargs", {}).items()}
-    arguments = {**COMMON, **settings.get("arguments", {}), "policy_kwargs": {**NETWORK, **network}}
+    arguments = {**COMMON, **settings.get("arguments", {}), "policy_kwargs": {**COMMON["policy_kwargs"], **network}}
     n_steps = 60 + 100 * n_envs * (4 if "train_freq" in arguments else 1)
 
     def made() -> Any:
-        return AGENTS[agent](POLICIES[kind], make_env(kind, n_envs), **arguments)
+        np.random.seed(0)
+        return AGENTS[settings["agent"]](policy, make_env(n_envs), **arguments)
 
     model = made()
     with tempfile.TemporaryDirectory() as folder:
@@ -123,10 +102,7 @@ def pieces(model: Any) -> Iterator[np.ndarray]:
 
 
 def digest(name: str) -> str:
-    """
-    :param name: name of a configuration
-    :return: the first 16 digits of the SHA-256 of these arrays
-    """
+    """:return: the first 16 digits of the SHA-256 of these arrays, for a configuration"""
     hashed = hashlib.sha256()
     for array in pieces(train(name)):
         hashed.update(np.ascontiguousarray(array).tobytes())
@@ -142,18 +118,18 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     before = json.loads(args.check.read_text())["hashes"] if args.check else {}
-    found = {}
+    found, n_identical = {}, 0
     for name in args.only:
         found[name] = digest(name)
-        verdict = "" if not args.check else "identical" if found[name] == before.get(name) else "DIFFERENT"
-        print(f"{name:28} {found[name]} {verdict}", flush=True)
+        n_identical += found[name] == before.get(name)
+        verdict = "identical" if found[name] == before.get(name) else "DIFFERENT"
+        print(f"{name:28} {found[name]} {verdict if args.check else ''}", flush=True)
     if args.write:
         about = {"torch": th.__version__, "numpy": np.__version__, "updates": "200 and more", "hashes": found}
         args.write.write_text(json.dumps(about, indent=2) + "\n")
-    different = [name for name in found if args.check and found[name] != before.get(name)]
     if args.check:
-        print(f"{len(found) - len(different)} of {len(found)} identical")
-    sys.exit(bool(different))
+        print(f"{n_identical} of {len(found)} identical")
+        sys.exit(n_identical < len(found))
 
 
 if __name__ == "__main__":

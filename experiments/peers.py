@@ -15,31 +15,13 @@ import tarfile
 import tempfile
 import xml.etree.ElementTree as ET
 
+import yaml
+
+from experiments import markdown
+
 SUITES = {"sb3-contrib": ("EqRQRDQN", "sb3_contrib.QRDQN"), "stable-baselines3": ("EqRRainbow", "stable_baselines3.DQN")}
-COPIED = (
-    "it expects a target network that differs from the online one; the defaults copy it after every update, as the paper does"
-)
-BUFFER = "it looks at the arrays of SB3's own replay buffer; ours stores each frame once"
-TRUNK = "it looks for a layer of a custom features extractor, which is at features_extractor.trunk here"
-HER = "hindsight replay uses its own buffer, without the sequences that the losses need"
-WARNINGS = (
-    "it expects other warnings: optimize_memory_usage has no effect here, and its unseeded agent may find returns outside "
-    "of C51's support"
-)
-MODULES = {"test_her": HER, "test_n_step_replay": "it expects SB3's own buffer for n-step returns"}
-REASONS = {  # tests, without their parameters
-    "test_feature_extractor_target_net": COPIED,
-    "test_features_extractor_target_net": COPIED,
-    "test_image_like_input": "it normalises integer images with VecNormalize, which is refused with a ValueError that says "
-    "what to pass: SB3 would store their terminal observations as other images",
-    "test_consistency": "MlpPolicy starts with a dense layer that MultiInputPolicy does not have",
-    "test_save_load_replay_buffer": BUFFER,
-    "test_offpolicy_collect_rollout_batch_norm": TRUNK,
-    "test_predict_with_dropout_batch_norm": TRUNK,
-    "test_fps_logger": "it expects 100 steps per second, but each step includes two updates",
-    "test_offpolicy_multi_env": "it expects updates after 3 steps, before a window of 10 steps is complete",
-    "test_warn_buffer": WARNINGS,
-}
+FILE = pathlib.Path(__file__).with_name("settings") / "peers.yml"
+REASONS: dict[str, str] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
 
 
 def fetch(package: str, folder: pathlib.Path) -> pathlib.Path:
@@ -75,29 +57,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, help="the Markdown page to write")
     args = parser.parse_args()
-    lines = ["# The tests of SB3 and sb3-contrib", "", " ".join(__doc__.split("\n\n")[0].split()), "", "```sh"]
-    lines += [
-        "python -m experiments.peers --out docs/results/peers.md",
-        "```",
-        "",
-        "| suite | agent | passed | skipped | failed |",
-    ]
-    lines.append("|---|---|---|---|---|")
-    failed: list[str] = []
+    rows, reasons, unexplained = [], [], 0
     for package, (agent, _) in SUITES.items():
         with tempfile.TemporaryDirectory() as folder:
             found = run(package, pathlib.Path(folder))
-        counts = " | ".join(str(len(found[outcome])) for outcome in ("passed", "skipped", "failed"))
-        lines.append(f"| {package} {importlib.metadata.version(package)} | {agent} | {counts} |")
-        failed += found["failed"]
-    lines += ["", "The tests that fail, and why:", ""]
-    unexplained = []
-    for test in failed:
-        module, _, name = test.partition(": ")
-        reason = MODULES.get(module) or REASONS.get(name.partition("[")[0])
-        unexplained += [] if reason else [test]
-        lines.append(f"- `{test}`: {reason or '**no reason is known**'}.")
-    text = "\n".join([*lines, ""])
+        counts = [str(len(found[outcome])) for outcome in ("passed", "skipped", "failed")]
+        rows.append([f"{package} {importlib.metadata.version(package)}", agent, *counts])
+        for test in found["failed"]:
+            module, _, name = test.partition(": ")
+            reason = REASONS.get(module) or REASONS.get(name.partition("[")[0])
+            unexplained += reason is None
+            reasons.append(f"- `{test}`: {reason or '**no reason is known**'}.")
+    about = " ".join(__doc__.split("\n\n")[0].split())
+    command = "```sh\npython -m experiments.peers --out docs/results/peers.md\n```"
+    counted = markdown(["suite", "agent", "passed", "skipped", "failed"], rows)
+    parts = [
+        "# The tests of SB3 and sb3-contrib",
+        about,
+        command,
+        counted,
+        "The tests that fail, and why:",
+        "\n".join(reasons),
+    ]
+    text = "\n\n".join(parts) + "\n"
     print(text)
     if args.out is not None:
         args.out.write_text(text, encoding="utf-8")

@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from experiments import markdown
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.benchmark.runs import Settings, plan_runs
 from sb3_eqr.benchmark.suites import choose, load_suite
@@ -47,15 +48,12 @@ def targets(planes: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
     :return: name -> (N,), row, column and count of each plane, as far as they vary; NaN where the plane is empty
     """
     found: dict[str, np.ndarray] = {}
-    lit = planes > 0
-    for channel, name in enumerate(names):
-        count = lit[:, channel].sum(axis=(1, 2))
-        rows, columns = (lit[:, channel].any(axis=axis) for axis in (2, 1))
-        for what, line in (("row", rows), ("column", columns)):
-            places = np.arange(10)
+    for name, lit in zip(names, np.moveaxis(planes > 0, 1, 0), strict=False):  # (N, 10, 10)
+        for what, axis in (("row", 2), ("column", 1)):
+            line = lit.any(axis=axis)
             with np.errstate(invalid="ignore"):
-                found[f"{name}: {what}"] = (line * places).sum(axis=1) / line.sum(axis=1)
-        found[f"{name}: number"] = count.astype(float)
+                found[f"{name}: {what}"] = (line * np.arange(10)).sum(axis=1) / line.sum(axis=1)
+        found[f"{name}: number"] = lit.sum(axis=(1, 2)).astype(float)
     return {name: value for name, value in found.items() if np.nanstd(value) > 1e-6}
 
 
@@ -88,26 +86,22 @@ def watch(model: Any, env: Any, suite: str, game: str, rng: np.random.Generator)
         action = rng.integers(0, env.action_space.n, 1) if rng.random() < 0.3 else action
         obs, *_ = env.step(action)
     seen = np.stack(frames)
-    order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
-    if suite != "minatar":
+    if suite == "minatar":
+        known = targets(seen, PLANES[game])
+    else:
         known = {name: np.stack(memory)[:, address].astype(float) for name, address in MEMORY[game].items()}
         if "ball: y" in known:  # 0 while no ball is in play, and x is then the last one or that of no ball
             is_out = known["ball: y"] == 0
             known |= {name: np.where(is_out, np.nan, known[name]) for name in ("ball: x", "ball: y")}
-    else:
-        known = targets(seen, PLANES[game])
+    order = rng.permutation(N_FRAMES)  # training and held-out frames are from the same episodes
     return seen[order], {name: positions[order] for name, positions in known.items()}
-
-
-def trunk(model: Any) -> Any:
-    """The trunk of an agent's encoder, with or without a group layer on top of it."""
-    encoder = model.policy.online.features_extractor
-    return encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder
 
 
 def trunk_features(model: Any, observations: th.Tensor) -> th.Tensor:
     """:return: (N, F), what the trunk and its layer norm make of observations, without a group layer on top of them"""
-    return model.policy.online.extract_features(observations, trunk(model))
+    encoder = model.policy.online.features_extractor
+    trunk = encoder.trunk if isinstance(encoder, GroupFeaturesExtractor) else encoder
+    return model.policy.online.extract_features(observations, trunk)
 
 
 def probe(model: Any, frames: Frames) -> dict[str, dict[str, float]]:
@@ -139,13 +133,11 @@ def scattered(env_id: str, env_kwargs: dict[str, Any]) -> Frames:
     return seen, known | ({"velocity": velocities} if is_pendulum else {})
 
 
-def print_table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> None:
-    """Print R² as a Markdown table: a row per object, a column per agent and what is probed."""
-    columns = [(agent, what) for agent in found for what in found[agent]]
-    print(f"| {title} | {' | '.join(f'{agent}, {what}' for agent, what in columns)} |")
-    print("|---|" + "---|" * len(columns))
-    for name in found[columns[0][0]]["trunk"]:
-        print(f"| {name} | " + " | ".join(f"{found[agent][what].get(name, np.nan):.2f}" for agent, what in columns) + " |")
+def table(title: str, found: dict[str, dict[str, dict[str, float]]]) -> str:
+    """:return: R² as a Markdown table: a row per object, a column per agent and what is probed"""
+    columns = {f"{agent}, {what}": values for agent, parts in found.items() for what, values in parts.items()}
+    names = next(iter(columns.values()))
+    return markdown([title, *columns], [[name, *(f"{values[name]:.2f}" for values in columns.values())] for name in names])
 
 
 def make(agent: str, suite: str, game: str, seed: int, steps: int) -> Any:
@@ -181,7 +173,7 @@ def main() -> None:
             seen = scattered(protocol["env_id"], protocol["preprocessing"].get("env_kwargs", {}))
         else:
             seen = watch(player, player.get_env(), args.suite, args.game, np.random.default_rng(seed))
-        print_table(f"seed {seed}", {name: probe(model, seen) for name, model in models.items()})
+        print(table(f"seed {seed}", {name: probe(model, seen) for name, model in models.items()}))
 
 
 if __name__ == "__main__":

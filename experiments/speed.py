@@ -25,8 +25,7 @@ from gymnasium import spaces
 from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
-from experiments.clock import Table, count_operations, median, take_turns
-from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, N_STACK, NETWORKS, SIZE, Floor, fill, make_agent
+from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, N_STACK, NETWORKS, Floor, Table, median, take_turns
 from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.saving.files import atomic_write
 
@@ -57,8 +56,10 @@ def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
     """An update of each agent on each network, compared with QRDQN's and the floor, in long rounds and in rounds of one."""
     for key in args.network or NETWORKS:
         n_updates, models = NETWORKS[key].n_updates, {name: workload.make_trainable(name, key, N_BEFORE) for name in AGENTS}
-        counted = {name: count_operations(partial(one.train, N_COUNTED, one.batch_size)) for name, one in models.items()}
+        updates = {name: partial(model.train, N_COUNTED, model.batch_size) for name, model in models.items()}
+        counted = {name: workload.count_operations(call) / N_COUNTED for name, call in updates.items()}
         floor = Floor(models[AGENT]) if key == "atari" else None
+        stored = {name: workload.bytes_per_transition(model) for name, model in models.items() if floor}
         calls: dict[str, Call] = {FLOOR: partial(floor.steps, n_updates)} if floor else {}
         for name, model in models.items():
             calls[name] = partial(model.train, n_updates, model.batch_size)
@@ -73,10 +74,8 @@ def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
             row = {"name": name, "ms": median(found[name].ms), "cpu_ms": median(found[name].cpu_ms)}
             row |= {"times_QRDQN": ratio(name, "QRDQN"), "times_floor": ratio(name, FLOOR)}
             row |= {"times_before": ratio(name, name + BEFORE), "round_of_one": ratio(name + ONES, name)}
-            row |= {"operations": counted[name] / N_COUNTED if name in models else None}
-            row |= {"page_faults": median(found[name].faults)}
-            row |= {"bytes_per_transition": workload.bytes_per_transition(models[name]) if floor and name in models else None}
-            rows.append(row)
+            row |= {"operations": counted.get(name), "page_faults": median(found[name].faults)}
+            rows.append(row | {"bytes_per_transition": stored.get(name)})
         notes = [floor.description()] if floor else []
         yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
 
@@ -110,8 +109,8 @@ def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
     for name in EQR_AGENTS:
         agents = []
         for graph in (False, False, True):
-            agents.append(make_agent(name, device=args.device, cuda_graph=graph))  # which seeds the generators
-            fill(agents[-1].replay_buffer, workload.N_STORED)
+            agents.append(workload.make_agent(name, device=args.device, cuda_graph=graph))  # which seeds the generators
+            workload.fill(agents[-1].replay_buffer, workload.N_STORED)
             agents[-1].train(N_BEFORE, agents[-1].batch_size)
         eager, again, captured = (th.cat([p.detach().flatten() for p in one.policy.parameters()]) for one in agents)
         apart_again, apart = (again - eager).abs().max().item(), (captured - eager).abs().max().item()
@@ -140,10 +139,10 @@ def repeat(call: Call) -> list[object]:
 
 def drawing_and_updating(size: int) -> dict[str, Call]:
     """Calls on a full buffer of ``size`` transitions: prioritised and uniform batches, and new priorities."""
-    space, actions = spaces.Box(0, 255, (N_STACK, SIZE, SIZE), np.uint8), spaces.Discrete(workload.N_ACTIONS)
+    space, actions = spaces.Box(0, 255, (N_STACK, workload.SIZE, workload.SIZE), np.uint8), spaces.Discrete(workload.N_ACTIONS)
     windows: dict[str, Any] = {"n_steps": 10, "prediction_depth": 5, "frame_stack": N_STACK}  # Table 5
     buffer = PrioritizedSequenceReplayBuffer(size, space, actions, "cpu", FILLED_BY, **windows)
-    fill(buffer, size // FILLED_BY)
+    workload.fill(buffer, size // FILLED_BY)
     n_drawable = (buffer.buffer_size - buffer.window) * buffer.n_envs
     batches = cycle(np.random.default_rng(0).integers(0, n_drawable, (1_000, BATCH_SIZE)))
     priorities = th.rand(BATCH_SIZE)
@@ -172,7 +171,7 @@ def measure_stored(args: argparse.Namespace) -> Table:
 
 def measure_n_envs(args: argparse.Namespace) -> Table:
     """Time of acting and storing by number of environments in one process."""
-    models = {str(n): make_agent(AGENT, env=workload.make_env("atari", n)) for n in N_ENVS}
+    models = {str(n): workload.make_agent(AGENT, env=workload.make_env("atari", n)) for n in N_ENVS}
     found = take_turns({n: partial(workload.play, one, N_PLAYED) for n, one in models.items()}, args.rounds, N_PLAYED)
     rows = [{"n_envs": n, "ms": median(found[n].ms), "growth": median(found[n].ms) / median(found["1"].ms)} for n in models]
     return Table("n_envs", f"Environments of random frames, {AGENT}: step of one environment, without updates", rows)

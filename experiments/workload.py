@@ -1,15 +1,20 @@
-"""The workload: agents on three networks, random frames for their replay buffers, and the floor of an update's time."""
+"""What the speed script measures and how: agents, random frames, the floor of an update's time; clocks, tables."""
 
 import importlib
 import pathlib
+import resource
 import sys
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import torch as th
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN
@@ -17,6 +22,8 @@ from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 from torch import nn
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.benchmark import timer
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
@@ -50,22 +57,15 @@ def random_frames(size: int, n_channels: int, n_actions: int) -> FakeImageEnv:
     return game
 
 
+FEW = {"n_quantiles": 51}
+ATARI, MINATAR = partial(random_frames, SIZE, 1, N_ACTIONS), partial(random_frames, 10, 4, 3)
+CARTPOLE = partial(gym.make, "CartPole-v1")
+SMALL: dict[str, Any] = {"features_extractor_kwargs": {"layers": [[16, 3, 1]]}, "net_arch": [128]}
+STILL = {"shift_pixels": 0, "intensity_scale": 0.0}
 NETWORKS = {
-    "atari": Network("CnnPolicy", lambda: random_frames(SIZE, 1, N_ACTIONS), N_STACK, n_updates=10),  # all at their defaults
-    "minatar": Network(
-        "CnnPolicy",
-        lambda: random_frames(10, 4, 3),
-        policy_kwargs={"features_extractor_kwargs": {"layers": [[16, 3, 1]]}, "net_arch": [128]},
-        qrdqn={"n_quantiles": 51},
-        eqr={"shift_pixels": 0, "intensity_scale": 0.0},
-    ),
-    "cartpole": Network(
-        "MlpPolicy",
-        lambda: gym.make("CartPole-v1"),
-        batch_size=64,
-        policy_kwargs={"net_arch": [256]},
-        qrdqn={"n_quantiles": 51},
-    ),
+    "atari": Network("CnnPolicy", ATARI, N_STACK, n_updates=10),  # all at their defaults
+    "minatar": Network("CnnPolicy", MINATAR, policy_kwargs=SMALL, qrdqn=FEW, eqr=STILL),
+    "cartpole": Network("MlpPolicy", CARTPOLE, batch_size=64, policy_kwargs={"net_arch": [256]}, qrdqn=FEW),
 }
 # Name -> class, and the convolutional extractor of its package.
 ALGORITHMS: tuple[type[Any], ...] = (DQN, QRDQN, EqRQRDQN, EqRRainbow)
@@ -77,22 +77,16 @@ def add_before(folder: str) -> None:
     """Add the EqR agents of a checkout of another version of the package to ``AGENTS``, as "... (before)"."""
 
     def forget() -> dict[str, ModuleType]:
-        names = [name for name in sys.modules if name.partition(".")[0] == "sb3_eqr"]
-        return {name: sys.modules.pop(name) for name in names}
+        return {name: sys.modules.pop(name) for name in list(sys.modules) if name.partition(".")[0] == "sb3_eqr"}
 
-    path, current = str(pathlib.Path(folder).resolve()), forget()
-    sys.path.insert(0, path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its environments override the registered ones
-            package = importlib.import_module("sb3_eqr")
-            conv_extractor = importlib.import_module("sb3_eqr.common.networks.encoders").ConvExtractor
-        found = {name: (getattr(package, name), conv_extractor) for name in EQR_AGENTS}
-    finally:
-        sys.path.remove(path)
-        forget()
-        sys.modules.update(current)
-    AGENTS.update({name + off + BEFORE: agent for off in ("", OFF) for name, agent in found.items()})
+    current = forget()
+    with mock.patch.object(sys, "path", [str(pathlib.Path(folder).resolve()), *sys.path]), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its environments override the registered ones
+        package = importlib.import_module("sb3_eqr")
+        extractor = importlib.import_module("sb3_eqr.common.networks.encoders").ConvExtractor
+    forget()
+    sys.modules.update(current)
+    AGENTS.update({name + off + BEFORE: (getattr(package, name), extractor) for off in ("", OFF) for name in EQR_AGENTS})
 
 
 def make_env(network: str, n_envs: int = 1) -> VecEnv:
@@ -105,10 +99,8 @@ def make_env(network: str, n_envs: int = 1) -> VecEnv:
 def make_agent(
     name: str, network: str = "atari", env: VecEnv | None = None, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
 ) -> Any:
-    """
-    Create an agent of ``AGENTS`` on one of ``NETWORKS``, which logs nothing. Its replay buffer is small and empty. ``env``
-    replaces the environment of the network; ``policy_kwargs`` and ``kwargs`` override its arguments.
-    """
+    """Create an agent of ``AGENTS`` that logs nothing, with a small and empty replay buffer; arguments override those of
+    the network."""
     (algorithm, conv_extractor), settings = AGENTS[name], NETWORKS[network]
     layers = {**settings.policy_kwargs, **(settings.qrdqn if name == "QRDQN" else {}), **(policy_kwargs or {})}
     if "features_extractor_kwargs" in layers:
@@ -164,8 +156,6 @@ class Floor:
     The convolutions of one update of an EqR agent whose target is a copy of its online network: without gradient for the
     observation after the transition and the M observations of the rollout; with gradient, except that of the images, for the
     observation itself. Each runs on separate inputs, float32, channels last.
-
-    :param model: the agent, which determines batch size, M and encoder
     """
 
     def __init__(self, model: Any):
@@ -175,10 +165,9 @@ class Floor:
         self._work: list[tuple[nn.Module, th.Tensor, th.Tensor, th.Tensor]] = []  # images: forward, trained; gradient
 
         def note(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
-            sizes = (self.n_forward, inputs[0]), (self.n_trained, inputs[0]), (self.n_trained, output)
-            forward, trained, gradient = (
-                th.rand(n, *one.shape[1:], device=model.device).to(memory_format=th.channels_last) for n, one in sizes
-            )
+            sizes = ((self.n_forward, *inputs), (self.n_trained, *inputs), (self.n_trained, output))
+            images = [th.rand(n, *one.shape[1:], device=model.device) for n, one in sizes]
+            forward, trained, gradient = (one.to(memory_format=th.channels_last) for one in images)
             self._work.append((module, forward, trained.requires_grad_(bool(self._work)), gradient))
 
         hooks = [module.register_forward_hook(note) for module in encoder.modules() if isinstance(module, nn.Conv2d)]
@@ -205,3 +194,75 @@ class Floor:
         """A description in one line."""
         images = f"{self.n_forward} images forward, {self.n_trained} forward and backward"
         return f"floor: {len(self._work)} convolutions, channels last, {images}: {self.flop / 1e9:.3f} GFLOP an update"
+
+
+class Series(NamedTuple):
+    """The cost of one of the calls compared, per round, (rounds,) each."""
+
+    ms: np.ndarray  # milliseconds of wall-clock time
+    cpu_ms: np.ndarray  # milliseconds of CPU time, over all threads of this process
+    faults: np.ndarray  # page faults
+
+    def ratio(self, other: "Series") -> float:
+        """Median of the ratios within a round: of CPU time if PyTorch has one thread, else of wall-clock time."""
+        numbers = (self.cpu_ms, other.cpu_ms) if th.get_num_threads() == 1 else (self.ms, other.ms)
+        return median(numbers[0] / numbers[1])
+
+
+def median(numbers: Any) -> float:
+    """The median as a Python float, for tables and JSON."""
+    return float(np.median(numbers))
+
+
+def read_clocks() -> np.ndarray:
+    """In the order of ``Series``, so far. PyTorch's timer waits for a GPU first; faults are those without reading a disk."""
+    return np.array([timer() * 1e3, time.process_time() * 1e3, resource.getrusage(resource.RUSAGE_SELF).ru_minflt])
+
+
+def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, n_per_call: int = 1) -> dict[str, Series]:
+    """
+    :param calls: the calls to compare; each is called once per round
+    :param rounds: number of rounds, after a first one that does not count
+    :param n_per_call: number of updates, samples, ... per call; the series are per update
+    """
+    found: dict[str, list[np.ndarray]] = {name: [] for name in calls}
+    for _ in range(rounds + 1):
+        for name, call in calls.items():
+            start = read_clocks()
+            call()
+            found[name].append((read_clocks() - start) / n_per_call)
+    return {name: Series(*np.array(numbers[1:]).T) for name, numbers in found.items()}
+
+
+def count_operations(call: Callable[[], object]) -> int:
+    """Operations that Python and the backward pass launch: the profiler's ``aten::`` events outside other such events."""
+    with profile(activities=[ProfilerActivity.CPU]) as profiled:
+        call()
+
+    def is_inside(event: Any) -> bool:
+        parent = event.cpu_parent
+        return parent is not None and (parent.name.startswith("aten::") or is_inside(parent))
+
+    return sum(event.name.startswith("aten::") and not is_inside(event) for event in profiled.events())
+
+
+class Table(NamedTuple):
+    """Rows as dictionaries, whose keys are the column names. None is printed as a dash, and a column of None is left out."""
+
+    name: str  # its key in the JSON file
+    title: str
+    rows: list[dict[str, Any]]
+    notes: list[str] = []  # lines below the table
+
+    def text(self) -> str:
+        """Title, aligned columns, notes."""
+        frame = pd.DataFrame(self.rows).dropna(axis="columns", how="all")
+        first = frame.columns[0]
+        frame = frame.set_index(first).rename(columns=lambda key: key.replace("_", " "))
+        shown = frame.rename_axis(index=None, columns=first).to_string(na_rep="-", float_format=three_digits)
+        return "\n".join([self.title, shown, *self.notes])
+
+
+def three_digits(number: float) -> str:
+    """Format with three digits, or with all digits before the decimal point."""
+    return f"{number:,.0f}" if abs(number) >= 99.95 else f"{number:#.3g}"

@@ -6,59 +6,24 @@ import pathlib
 import sys
 import time
 
+import yaml
+
 from experiments.attacks import Finding
 from experiments.attacks.kills import FORK
 from sb3_eqr import EqRRainbow
 
 LONGEST = 5.0  # seconds until it must exit
 MODULES = {"benchmark": "sb3_eqr.benchmark.__main__", "visualize": "sb3_eqr.visualize.__main__"}
-# Invalid files of hyperparameters. In KEYS, the value that follows the entry's own overrides it.
-ENTRIES = ["[]", "3", "text", "CartPole-v1: [1, 2]", "CartPole-v1: 3", "CartPole-v1: text", "{", "a: b: c", "\x00"]
-ENTRIES += [f"CartPole-v1: {{{e}}}" for e in ("policy: MlpPolicy", "n_timesteps: 10", "policy: NoPolicy, n_timesteps: 10")]
-KEYS = """
-n_timesteps: many | n_timesteps: -1 | n_timesteps: .nan | n_envs: 0 | n_envs: two | frame_stack: -1 | normalize: [1]
-policy_kwargs: text | policy_kwargs: [1] | policy_kwargs: {group: SU(2)} | policy_kwargs: {n_blocks: 0}
-policy_kwargs: {noisy: 3} | learning_rate: fast | learning_rate: lin_x | learning_rate: -1 | buffer_size: 1
-batch_size: 0 | gamma: 2 | tau: -1 | max_grad_norm: -1 | n_steps: 0 | train_freq: 0 | train_freq: [1, hour]
-env_wrapper: no.such.Wrapper | env_wrapper: 3 | callback: no.such.Callback | resets: {intervall: 3}
-prediction_depth: -1 | aet_coef: text | replay_buffer_kwargs: {alpha: -1} | seed: 3 | device: cpu | unknown: 1
-shift_pixels: 1.5
-"""
-SUITES = ["[]", "3", "own: 3", "own: {}", "own: {env_id: '{game}', games: CartPole-v1, steps: 10, evaluation: {}}", "{"]
-SUITES += ["own: {env_id: '{game}', games: [CartPole-v1], steps: -10, evaluation: {}}"]
-GOOD = "episodes: 2, n_envs: 1, curve: {points: 2, episodes: 1}"
-for scores in ("[1, 1]", "[2, 1]", "[.nan, 1]", "[1]", "text", "[0, .inf]", "null"):
-    rest = f"evaluation: {{{GOOD}}}, normalisation: {{unit: u, source: s, scores: {{CartPole-v1: {scores}}}}}"
-    SUITES.append(f"own: {{env_id: '{{game}}', games: [CartPole-v1], steps: 10, {rest}}}")
-# The beginning of a command line > what follows it. Words in capitals are replaced by others, see ``command_lines``.
-LINES = """
-> trian | --nothing | train --algo | train --algo eqr | train --algo eqr_qrdqn --env | enjoy --algo eqr
-train --algo eqr_qrdqn -n 20 --env > CartPol-v1 | Pendulum-v1 | NoSuch-v0 | ALE/Pog-v5 | MinAtar/Pong-v1 | /
-TRAIN --conf-file > ENTRIES | no.yml | nofile
-TRAIN -n 20 > -n many | --seed x | --device nodevice | --device cuda | --vec-env none | --num-threads x
-TRAIN -n 20 > --eval-freq x | -params n_stepz:3 | -params gamma:x | -params gamma | -params gamma:2
-TRAIN -n 20 -i > ZIPS | FOLDER/ | FOLDER/model.zip
-TRAIN -n 20 --resume > nowhere | ZIPS | NOTHING
-TRAIN -n 20 --checkpoint-every > 0 | x | -3 | NOTHING
-train --algo ppo --env CartPole-v1 -n 20 -f FOLDER/logs > --resume nowhere | --checkpoint-every 5
-enjoy AGENT > -f nowhere | --env NoSuch-v0 | -f FOLDER --exp-id 7 | -f FOLDER --load-best | --algo eqr_qrdnq
-record_video AGENT > -f nowhere | --env NoSuch-v0 | -f FOLDER --exp-id 7 | -f FOLDER --load-best | --algo eqr_qrdnq
-push_to_hub AGENT > -f nowhere | --env NoSuch-v0 | -f FOLDER --exp-id 7 | -f FOLDER --load-best | --algo eqr_qrdnq
-plot_train > -a eqr_qrdqn -e NoSuch-v0 -f FOLDER/empty | --nothing
-all_plots > -a eqr_qrdqn -e NoSuch-v0 -f FOLDER/empty | --nothing
-plot_from_file > -a eqr_qrdqn -e NoSuch-v0 -f FOLDER/empty | --nothing
-visualize --env CartPole-v1 --out FOLDER/out > ZIPS | FOLDER/
-SHOW > --env NoSuch-v0 | --env Acrobot-v1 | NOTHING | --steps x | --algo ppo
-SHOW --env CartPole-v1 > --steps 0 | --depth -1 | --n-envs 0 | --seed -1 | --device nodevice | --env-kwargs x
-SHOW --env CartPole-v1 > --env-kwargs nothing:3
-RUN own --suite-file > SUITES | none.yml
-RUN > nosuite | smoke --agents nobody | smoke --agents eqr_qrdqn:nothing | smoke --games Pong | smoke --seeds 0
-RUN smoke > --seeds x | --steps 0 | --steps -5 | --device nodevice | --cpus-per-run 0 | --gpus-per-run 9
-RUN smoke > --address nowhere:1 | --checkpoint-every -1 | --checkpoint-every x | --agents qrdqn:stock qrdqn:stock
-benchmark report > nowhere | ZIPS | NOTHING
-benchmark status > nowhere | ZIPS | NOTHING
-benchmark > NOTHING | rum | report FOLDER/empty --reference x | status --nothing
-"""
+TABLE = yaml.safe_load((pathlib.Path(__file__).parents[1] / "settings" / "command_lines.yml").read_text(encoding="utf-8"))
+ENTRY = "CartPole-v1: {policy: MlpPolicy, n_timesteps: 10, %s}"
+SUITE = """own: {env_id: "{game}", games: [CartPole-v1], steps: 10,
+  evaluation: {episodes: 2, n_envs: 1, curve: {points: 2, episodes: 1}},
+  normalisation: {unit: u, source: s, scores: {CartPole-v1: %s}}}"""
+
+
+def cells(text: str) -> list[str]:
+    """:return: what a text has between bars and ends of lines"""
+    return [cell.strip() for line in text.strip().splitlines() for cell in line.split("|")]
 
 
 def write_files(folder: pathlib.Path) -> None:
@@ -68,18 +33,15 @@ def write_files(folder: pathlib.Path) -> None:
     (folder / "text.zip").write_text("no zip file")
     (folder / "half.zip").write_bytes(model.read_bytes()[: model.stat().st_size // 2])
     (folder / "empty").mkdir()
-    keys = [key for line in KEYS.strip().splitlines() for key in line.split(" | ")]
-    entries = ENTRIES + [f"CartPole-v1: {{policy: MlpPolicy, n_timesteps: 10, {key}}}" for key in keys]
-    for name, contents in (("entry", entries), ("suite", SUITES)):
+    entries = TABLE["entries"] + [ENTRY % key for key in cells(TABLE["keys"])]
+    suites = TABLE["suites"] + [SUITE % scores for scores in cells(TABLE["scores"])]
+    for name, contents in (("entry", entries), ("suite", suites)):
         for number, content in enumerate(contents):
             (folder / f"{name}_{number}.yml").write_text(content)
 
 
 def command_lines(folder: pathlib.Path) -> list[str]:
-    """
-    :param folder: the folder of :func:`write_files`
-    :return: the command lines of ``LINES``
-    """
+    """:return: the command lines of the table, for the folder of :func:`write_files`"""
     words = {
         "TRAIN": "train AGENT --eval-freq -1 -f FOLDER/logs",
         "AGENT": "--algo eqr_qrdqn --env CartPole-v1",
@@ -91,11 +53,11 @@ def command_lines(folder: pathlib.Path) -> list[str]:
         "NOTHING": "",
         "FOLDER": str(folder),
     }
-    table = LINES.strip()
+    table = TABLE["lines"]
     for word, text in words.items():
         table = table.replace(word, text)
     rows = [line.split(">") for line in table.splitlines()]
-    return [f"{start.strip()} {end.strip()}".strip() for start, ends in rows for end in ends.split("|")]
+    return [f"{start.strip()} {end}".strip() for start, ends in rows for end in cells(ends)]
 
 
 def answer(line: str, log: pathlib.Path) -> None:

@@ -10,9 +10,8 @@ import pytest
 import torch as th
 
 from experiments import speed, workload
-from experiments.clock import Series, Table, count_operations, take_turns
 from experiments.speed import growth
-from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, bytes_per_transition, fill, make_agent
+from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, Series, Table, fill, make_agent
 from sb3_eqr import EqRQRDQN
 from tests.tools.test_package import ROOT
 
@@ -34,7 +33,7 @@ def test_floor_by_hand(name, kwargs, n_forward):
 
 
 def test_bytes_per_transition():
-    stock, ours = (bytes_per_transition(make_agent(name)) for name in ("QRDQN", "EqRQRDQN"))
+    stock, ours = (workload.bytes_per_transition(make_agent(name)) for name in ("QRDQN", "EqRQRDQN"))
     assert ours <= 8_500 < 56_000 < stock
 
 
@@ -62,16 +61,16 @@ class Cube(th.autograd.Function):
 
 def test_operations_by_hand():
     x, weight, gradient = th.ones(2, 3, requires_grad=True), th.ones(4, 3), th.ones(2, 3)
-    assert count_operations(lambda: (x * x).sum()) == 2
-    assert count_operations(lambda: th.nn.functional.linear(x, weight)) == 1  # nested operations are not counted
-    assert count_operations(lambda: th.autograd.grad(x * gradient, x, gradient)) == 2
-    assert count_operations(lambda: th.autograd.grad(Cube.apply(x), x, gradient)) == 5
+    assert workload.count_operations(lambda: (x * x).sum()) == 2
+    assert workload.count_operations(lambda: th.nn.functional.linear(x, weight)) == 1  # nested operations are not counted
+    assert workload.count_operations(lambda: th.autograd.grad(x * gradient, x, gradient)) == 2
+    assert workload.count_operations(lambda: th.autograd.grad(Cube.apply(x), x, gradient)) == 5
 
 
 def test_calls_are_timed_alternately():
     order = []
     calls = {name: lambda name=name: order.append(name) for name in "ab"}
-    timings = take_turns(calls, rounds=3, n_per_call=2)
+    timings = workload.take_turns(calls, rounds=3, n_per_call=2)
     assert order == list("ab" * 4)  # the first round is a warm-up
     assert [len(numbers) for name in "ab" for numbers in timings[name]] == [3] * 6
 
