@@ -33,7 +33,12 @@ def train(folder: pathlib.Path) -> None:
     """Start a run, or resume it from its last checkpoint, and finish it."""
     options: dict[str, Any] = {"train_freq": 8, "gradient_steps": 1, "learning_starts": 100, "buffer_size": 2_000}
     options["policy_kwargs"] = {"net_arch": [16], "latent_hidden_dim": 16}
-    finish(folder, make_vec_env("CartPole-v1"), STEPS, SAVE_FREQ, seed=0, **options).save(folder / "final.zip")
+    run = partial(finish, folder, make_vec_env("CartPole-v1"), STEPS, SAVE_FREQ, seed=0, **options)
+    try:
+        model = run()
+    except ValueError:  # another run began in this folder meanwhile: resume from its checkpoint
+        model = run()
+    model.save(folder / "final.zip")
 
 
 def kill_until_done(start: Callable[[], Any], kills: int, rng: random.Random, at_once: int = 1) -> tuple[list[Any], int]:
