@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments import markdown
 from experiments.peer_calls import PEERS
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -149,9 +150,8 @@ def table(rows: list[Row]) -> str:
         return "-" if value is None else str(value)
 
     keys = [key for key in rows[0] if key not in ("note", "rounds")]
-    lines = [f"| {' | '.join(key.replace('_', ' ') for key in keys)} |", f"|{'---|' * len(keys)}"]
-    lines += [f"| {' | '.join(cell(row[key]) for key in keys)} |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {row['name']}: {row['note'].rstrip('.')}." for row in rows if row["note"])])
+    lines = markdown([key.replace("_", " ") for key in keys], [[cell(row[key]) for key in keys] for row in rows])
+    return "\n".join([lines, "", *(f"- {row['name']}: {row['note'].rstrip('.')}." for row in rows if row["note"])])
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:

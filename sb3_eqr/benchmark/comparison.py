@@ -103,7 +103,8 @@ def compare(
     found = {folder: read(pathlib.Path(folder)) for folder in folders}
     suites = [suite for suite, _ in found.values()]
     finished = {folder: [row for row in rows if "stopped_at" not in row] for folder, (_, rows) in found.items()}
-    results = _select(finished, [*agents, *([baseline] if baseline and agents else [])])
+    wanted = [*agents, *([baseline] if baseline and agents else [])]
+    results = _select(finished, wanted)
     bounds = _bounds(suites, results)
     games, chosen, notes = selection.choose_runs(results, [game for suite in suites for game in suite.games], force)
     if baseline is not None and baseline not in chosen:
@@ -114,8 +115,8 @@ def compare(
     used.sort(key=lambda row: (agents.index(row["agent"]), games.index(row["game"]), row["seed"]))
     if stopped := sum(len(rows) - len(finished[folder]) for folder, (_, rows) in found.items()):
         notes.append(f"{stopped} runs were stopped before their end and are left out.")
-    unfinished = [run.label for folder, (_, rows) in found.items() for run in _unfinished(folder, rows)]
-    if unfinished:
+    left = [run for folder, (_, rows) in found.items() for run in _unfinished(folder, rows)]
+    if unfinished := [run.label for run in left if not wanted or run.agent.name in wanted]:
         notes.append(f"Left out, because they have not finished: {'; '.join(unfinished)}.")
     notes += [*selection.never_learn(used), *selection.settings_differences(used)]
     differing = selection.protocol_differences(used)

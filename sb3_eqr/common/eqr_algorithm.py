@@ -94,7 +94,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         intensity_scale: float = 0.05,
         resets: ResetSchedule | dict[str, Any] | None = None,
         cuda_graph: bool = False,
-        bfloat16_targets: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -150,9 +149,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             its fields as a dictionary; ``None``: neither
         :param cuda_graph: on a GPU, capture losses and gradients of an update as one CUDA graph: a fifth of the time, with the
             same results up to rounding (:mod:`sb3_eqr.common.cuda_graph`); warns if it runs eagerly instead
-        :param bfloat16_targets: whether encoders compute in bfloat16 where no gradient flows: for the next observation of the
-            TD loss and for the rollout's observations. Saves a fifth of an update's time on Atari; the features have a
-            relative error of 0.5%. Warns if the hardware has no such arithmetic, where it is slower
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation, see
@@ -211,7 +207,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.intensity_scale = intensity_scale
         self.resets = resets
         self.cuda_graph = cuda_graph
-        self.bfloat16_targets = bfloat16_targets
         self.policy_description: dict[str, str] = {}  # saved with the model, see EqRPolicy.description
         self.representation_frozen = False  # set by load_representation; saved with the model
         self._resets = Resets(ResetSchedule.of(resets))  # saved with the model
@@ -245,14 +240,14 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         keep_freed_memory()
 
     def _set_up_objective(self) -> None:
-        if self.bfloat16_targets:
+        if self.policy.bfloat16_targets:
             validation.warn_of_slow_bfloat16(self.device)
         self._objective_options = self._options_of_objective()
         self.objective = Objective(self.policy, **self._objective_options)
         self._captured = CapturedGradients(self.objective, self._trained) if self.cuda_graph else None
 
     def _options_of_objective(self) -> dict[str, Any]:
-        names = ("double_q", "shift_pixels", "intensity_scale", "aux_gradient_share", "bfloat16_targets")
+        names = ("double_q", "shift_pixels", "intensity_scale", "aux_gradient_share")
         options = {name: getattr(self, name) for name in names}
         return {**options, "target_is_copied": self.tau == 1 and self.target_update_interval is None}
 

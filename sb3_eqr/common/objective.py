@@ -45,7 +45,7 @@ class Objective:
     """
     The sum of TD and auxiliary losses that an update minimises.
 
-    :param policy: online and target network, latent model
+    :param policy: online and target network, latent model; whether encoders compute in bfloat16 where no gradient flows
     :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
     :param shift_pixels: random shift of images, in pixels, ≥ 0, see :class:`Augmentation`
     :param intensity_scale: random intensity of images, ≥ 0
@@ -53,7 +53,6 @@ class Objective:
         gradient's norm; ``None``: no cap
     :param target_is_copied: whether the target network is a copy of the online one before each update. Then its encoder is the
         online one, unless that computes something else in train mode
-    :param bfloat16_targets: whether encoders compute in bfloat16 where no gradient flows
     """
 
     def __init__(
@@ -64,7 +63,6 @@ class Objective:
         intensity_scale: float,
         aux_gradient_share: float | None = None,
         target_is_copied: bool = False,
-        bfloat16_targets: bool = False,
     ):
         self.policy = policy
         self.double_q = double_q
@@ -77,7 +75,7 @@ class Objective:
         self.target_encoder = self.encoder if is_online else policy.target.features_extractor
         of_latent = self.target_encoder if policy.options.latent_tau is None else self.encoder
         self.latent_encoder = policy.latent_encoder or of_latent
-        self.target_dtype = th.bfloat16 if bfloat16_targets else th.float32
+        self.target_dtype = th.bfloat16 if policy.bfloat16_targets else th.float32
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: Mapping[str, float]) -> LossTerms:
         """

@@ -185,9 +185,11 @@ def check_trained(args: argparse.Namespace) -> None:
         runs = pathlib.Path(args.folder, algo).glob(f"{name}_*/*.zip")
         places = {run.parent.name.rpartition("_")[2]: run for run in runs}
         ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
-        unfinished = sorted(pathlib.Path(args.folder, algo).glob(f"{name}_*/{FOLDER}"))
+        unfinished = list(pathlib.Path(args.folder, algo).glob(f"{name}_*/{FOLDER}"))
         if unfinished and not places:
-            run = unfinished[-1].parent
+            run = max(
+                unfinished, key=lambda checkpoints: checkpoints.stat().st_mtime
+            ).parent  # the latest: _10 sorts before _2
             found = f"{run} was interrupted: sb3-eqr train --algo {algo} --env {args.env} -f {args.folder} --resume {run}"
         elif ids:
             found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."

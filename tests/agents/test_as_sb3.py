@@ -92,7 +92,7 @@ def test_arguments_of_the_other_agent_and_of_its_policy(make):
 
 def test_the_signature_shows_the_constructors_arguments(make):
     parameters = inspect.signature(make.algorithm).parameters
-    assert len(parameters) <= 39 and list(parameters)[:3] == ["policy", "env", "learning_rate"]
+    assert len(parameters) <= 38 and list(parameters)[:3] == ["policy", "env", "learning_rate"]
     assert not any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     assert not any(name.startswith(("get_", "set_")) for name in parameters)
 

@@ -257,7 +257,7 @@ def test_bfloat16_only_where_no_gradient_flows(make, monkeypatch, policy, env):
     samples = model.replay_buffer.sample(8)
     found = []
     for bfloat16_targets in (False, True):
-        model.bfloat16_targets = bfloat16_targets
+        model.policy.bfloat16_targets = bfloat16_targets
         model._set_up_objective()
         monkeypatch.setattr(th.nn.Conv2d, "forward", watched)
         th.manual_seed(0)
@@ -274,7 +274,7 @@ def test_bfloat16_only_where_no_gradient_flows(make, monkeypatch, policy, env):
 def test_bfloat16_without_instructions_for_it_warns(make, monkeypatch):
     monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx2": True, "avx512_bf16": False}, raising=False)
     with pytest.warns(UserWarning, match="no instructions for bfloat16 on cpu"):
-        model = make(ChainEnv(), bfloat16_targets=True)
+        model = make(ChainEnv(), policy_kwargs={"bfloat16_targets": True})
     monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"amx_bf16": True}, raising=False)
     assert model.learn(60)._n_updates > 0
 

@@ -261,6 +261,8 @@ def test_an_agent_without_a_finished_run_is_named(tmp_path, report_of):
     (folder / "runs/sac/Pong/4/run.json").write_text(json.dumps(plan))
     page = write_report([folder], {}, False, tmp_path / "report", reps=5)
     assert "Left out, because they have not finished: sac, Pong, seed 4." in text_of(page)
+    page = write_report([folder], {}, False, tmp_path / "report", agents=[BASE, FULL], reps=5)
+    assert "have not finished" not in text_of(page)
 
 
 def test_missing_runs_are_omitted_and_reported(tmp_path, report_of):
