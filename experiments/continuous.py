@@ -3,7 +3,7 @@ The gate of an agent for continuous actions: does a latent model make SB3's SAC 
 first run, is experiments/settings/continuous/README.md.
 
     python experiments/continuous.py train runs/gate --tasks HalfCheetah-v5 --arms sac se2 --seeds 0
-    python experiments/continuous.py report docs/results/continuous.jsonl.xz
+    python experiments/continuous.py report docs/results/continuous_gate.xz
 """
 
 import argparse
@@ -269,7 +269,7 @@ def main() -> None:
     running.add_argument("--steps", type=int, default=N_STEPS)
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
-    reporting.add_argument("--pack", type=pathlib.Path, help="also write all runs into this .jsonl.xz file")
+    reporting.add_argument("--pack", type=pathlib.Path, help="also write all runs into this file, packed by xz")
     args = parser.parse_args()
     if args.command == "train":
         train(args.folder, args.tasks, args.arms, args.seeds, args.steps)
