@@ -1,5 +1,5 @@
 """
-The cost of an update and of replay, also by size: ``python -m experiments.speed`` (docs/results/speed.md).
+The cost of an update, and of its parts: ``python -m experiments.speed`` (docs/results/speed.md).
 
 The agents compared run alternately in one process. Milliseconds are medians over the rounds; ratios are computed within each
 round, and their median is shown.
@@ -12,21 +12,22 @@ import pathlib
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
-from itertools import cycle
-from math import log2
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import stable_baselines3
 import torch as th
-from gymnasium import spaces
+from torch.utils.benchmark import Timer
 from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
-from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, N_STACK, NETWORKS, Floor, Table, median, take_turns
-from sb3_eqr import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, NETWORKS, OFF, Floor, Table, median, take_turns
+from sb3_eqr.common import eqr_algorithm
 from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
@@ -34,15 +35,8 @@ TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others that warm up
 NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
-AGENT = "EqRQRDQN"  # of sizes
-STORED, FILLED_BY = (10_000, 100_000, 1_000_000), 20  # transitions, and number of environments that add them
-N_ENVS, N_PLAYED, N_UPDATES, N_DRAWS = (1, 8, 32), 256, 2, 30
-VARIANTS: dict[str, dict[Any, dict[str, Any]]] = {
-    "M": {m: {"prediction_depth": m} for m in (0, 1, 2, 3, 5, 7, 10)},
-    "K": {k: {"policy_kwargs": {"n_blocks": k}} for k in (4, 8, 16, 32, 64)},
-    "group": {group: {"policy_kwargs": {"group": group}} for group in ("SE(2)", "SE(3)", "SO(6)", "GL(4)")},
-}
-Call = Callable[[], object]
+AGENT = "EqRRainbow"  # of parts
+Call = Callable[..., object]
 Row = dict[str, Any]
 
 
@@ -127,83 +121,53 @@ def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
     yield Table("graph", f"Update as a CUDA graph, atari, {args.device}", rows, notes)
 
 
-def growth(costs: Sequence[float], arithmetic: Sequence[float]) -> list[float]:
-    """Growth of the costs since the first size, divided by that of the arithmetic, in any unit."""
-    return [(cost / costs[0]) / (work / arithmetic[0]) for cost, work in zip(costs, arithmetic, strict=True)]
+class Timed:
+    """A function, and the CPU time of its calls in milliseconds."""
+
+    def __init__(self, call: Call):
+        self.call, self.ms = call, 0.0
+
+    def __call__(self, *args: Any, **kwargs: Any) -> object:
+        start = time.process_time()
+        result = self.call(*args, **kwargs)
+        self.ms += (time.process_time() - start) * 1e3
+        return result
 
 
-def repeat(call: Call) -> list[object]:
-    """Call it ``N_DRAWS`` times, since one call is too short to time."""
-    return [call() for _ in range(N_DRAWS)]
+def measure_parts(args: argparse.Namespace) -> Iterator[Table]:
+    """Where the CPU time of an update goes: by part, and what its arithmetic would take as plain products of matrices."""
+    rows_by_width, square = th.rand(5 * BATCH_SIZE, 256), th.rand(256, 256)  # M rows of each sample, hidden units
+    product = Timer("a @ b", globals={"a": rows_by_width, "b": square}, num_threads=args.threads)
+    rate = 2e-9 * 256 * rows_by_width.numel() / product.blocked_autorange().median
+    for key in args.network or NETWORKS:
+        rows: list[Row] = []
+        for name in ("QRDQN", AGENT + OFF, AGENT):
+            model = workload.make_trainable(name, key, N_BEFORE)
+            with FlopCounterMode(display=False) as counter:
+                model.train(1, model.batch_size)
+            flop, n_updates = counter.get_total_flops(), args.rounds * NETWORKS[key].n_updates
+            parts = {
+                "update": (model, "train"),
+                "sample": (model.replay_buffer, "sample"),
+                "Adam": (model.policy.optimizer, "step"),
+            }
+            if name != "QRDQN":
+                parts |= {"losses": (model, "objective"), "backward": (eqr_algorithm, "assign_gradients")}
+                parts |= {"clip": (model, "_clip_gradients"), "target": (model.policy, "update_target")}
+            with ExitStack() as patches:
+                timed = {part: Timed(getattr(*place)) for part, place in parts.items()}
+                for part, (owner, attribute) in parts.items():
+                    patches.enter_context(mock.patch.object(owner, attribute, timed[part]))
+                model.train(n_updates, model.batch_size)
+            ms = {f"{part}_ms": one.ms / n_updates for part, one in timed.items()}
+            rows.append({"name": name, "MFLOP": flop / 1e6, "products_ms": flop / rate / 1e6, **ms})
+        notes = [
+            f"products: the same arithmetic at {rate:.0f} GFLOP/s, as a product of {5 * BATCH_SIZE}x256 and 256x256 takes"
+        ]
+        yield Table(f"parts_{key}", f"Parts of an update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
 
 
-def drawing_and_updating(size: int) -> dict[str, Call]:
-    """Calls on a full buffer of ``size`` transitions: prioritised and uniform batches, and new priorities."""
-    space, actions = spaces.Box(0, 255, (N_STACK, workload.SIZE, workload.SIZE), np.uint8), spaces.Discrete(workload.N_ACTIONS)
-    windows: dict[str, Any] = {"n_steps": 10, "prediction_depth": 5, "frame_stack": N_STACK}  # Table 5
-    buffer = PrioritizedSequenceReplayBuffer(size, space, actions, "cpu", FILLED_BY, **windows)
-    workload.fill(buffer, size // FILLED_BY)
-    n_drawable = (buffer.buffer_size - buffer.window) * buffer.n_envs
-    batches = cycle(np.random.default_rng(0).integers(0, n_drawable, (1_000, BATCH_SIZE)))
-    priorities = th.rand(BATCH_SIZE)
-    return {
-        "sample": partial(buffer.sample, BATCH_SIZE),
-        "update_priorities": lambda: buffer.update_priorities(next(batches), priorities),
-        "uniform_sample": partial(SequenceReplayBuffer.sample, buffer, BATCH_SIZE),
-    }
-
-
-def measure_stored(args: argparse.Namespace) -> Table:
-    """Time of a batch of windows by number of stored transitions, up to the largest."""
-    sizes = [size for size in STORED if size <= args.largest]
-    work = {size: drawing_and_updating(size) for size in sizes}
-    calls = {f"{what} {size}": partial(repeat, call) for size in sizes for what, call in work[size].items()}
-    found = take_turns(calls, args.rounds, N_DRAWS)
-    rows: list[Row] = [{"transitions": size} for size in sizes]
-    for what in work[sizes[0]]:
-        costs = [median(found[f"{what} {size}"].ms) for size in sizes]
-        grown = growth(costs, [1.0 if what == "uniform_sample" else log2(size) for size in sizes])
-        for place, row in enumerate(rows):
-            row |= {f"{what}_ms": costs[place], f"{what}_growth": grown[place]}
-    notes = ["growth: of the time, over that of log2 of the transitions where priorities are used"]
-    return Table("stored_transitions", f"Replay, a batch of {BATCH_SIZE} windows, n = 10, M = 5", rows, notes)
-
-
-def measure_n_envs(args: argparse.Namespace) -> Table:
-    """Time of acting and storing by number of environments in one process."""
-    models = {str(n): workload.make_agent(AGENT, env=workload.make_env("atari", n)) for n in N_ENVS}
-    found = take_turns({n: partial(workload.play, one, N_PLAYED) for n, one in models.items()}, args.rounds, N_PLAYED)
-    rows = [{"n_envs": n, "ms": median(found[n].ms), "growth": median(found[n].ms) / median(found["1"].ms)} for n in models]
-    return Table("n_envs", f"Environments of random frames, {AGENT}: step of one environment, without updates", rows)
-
-
-def measure_variants(size: str, rounds: int) -> Table:
-    """Time of an update by M, K or the group, compared with the floor."""
-    models = {str(value): workload.make_trainable(AGENT, **kwargs) for value, kwargs in VARIANTS[size].items()}
-    floors = {name: Floor(model) for name, model in models.items()}
-    calls: dict[str, Call] = {f"floor {name}": partial(floors[name].steps, N_UPDATES) for name in models}
-    calls |= {name: partial(model.train, N_UPDATES, model.batch_size) for name, model in models.items()}
-    found = take_turns(calls, rounds, N_UPDATES)
-    rows: list[Row] = []
-    for name, model in models.items():
-        with FlopCounterMode(display=False) as counter:
-            model.train(1, model.batch_size)
-        step, floor, gflop = found[name], found[f"floor {name}"], counter.get_total_flops() / 1e9
-        row = {size: name, "GFLOP": gflop, "GFLOP_beyond_floor": gflop - floors[name].flop / 1e9, "ms": median(step.ms)}
-        row |= {"times_floor": step.ratio(floor), "ms_beyond_floor": median(step.ms - floor.ms)}
-        rows.append({**row, "page_faults": median(step.faults)})
-    grown = growth([row["ms_beyond_floor"] for row in rows], [row["GFLOP_beyond_floor"] for row in rows])
-    rows = [{**row, "growth": value} for row, value in zip(rows, grown, strict=True)]
-    return Table(size, f"Update of {AGENT} by {size}", rows, ["growth: of ms over that of GFLOP, both beyond the floor"])
-
-
-def measure_sizes(args: argparse.Namespace) -> Iterator[Table]:
-    """Cost against size: stored transitions, environments, depth M, blocks K, groups."""
-    yield from (measure_stored(args), measure_n_envs(args))
-    yield from (measure_variants(size, args.rounds) for size in VARIANTS)
-
-
-PARTS = {"updates": measure_updates, "neighbour": measure_neighbour, "graph": measure_graph, "sizes": measure_sizes}
+PARTS = {"updates": measure_updates, "neighbour": measure_neighbour, "graph": measure_graph, "parts": measure_parts}
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -211,21 +175,20 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=__doc__.strip().split("\n")[0])
     several = partial(str.split, sep=",")
     parser.add_argument("--only", type=several, default=["updates", "neighbour"], help=f"some of {', '.join(PARTS)}")
-    parser.add_argument("--network", type=several, help=f"of updates: some of {', '.join(NETWORKS)}; default: all")
+    parser.add_argument("--network", type=several, help=f"of updates and parts: some of {', '.join(NETWORKS)}; default: all")
     parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
     parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
     parser.add_argument("--device", default="cpu", help="of graph: cuda, or cpu to test the script")
     parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured alternately with this one")
-    parser.add_argument("--largest", type=int, default=STORED[-1], metavar="N", help="largest buffer of sizes; 7.2 kB each")
     parser.add_argument("--json", metavar="FILE", help="also write all tables to this file")
     args = parser.parse_args(arguments)
     for option, known in (("only", PARTS), ("network", NETWORKS)):
         for name in getattr(args, option) or []:
             if name not in known:
                 parser.error(f"--{option} must be some of {', '.join(known)}, got {name!r}")
-    for option, least in (("threads", 1), ("rounds", 1), ("largest", STORED[0])):
-        if getattr(args, option) < least:
-            parser.error(f"--{option} must be an integer >= {least}, got {getattr(args, option)}")
+    for option in ("threads", "rounds"):
+        if getattr(args, option) < 1:
+            parser.error(f"--{option} must be an integer >= 1, got {getattr(args, option)}")
     if args.before and not (pathlib.Path(args.before) / "sb3_eqr" / "__init__.py").is_file():
         parser.error(f"--before must be a folder with sb3_eqr in it, got {args.before!r}")
     return args

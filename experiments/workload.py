@@ -33,7 +33,7 @@ SIZE, N_STACK, N_ACTIONS = 84, 4, 6  # Atari's frames, Pong's actions
 BATCH_SIZE = 32  # Table 5, and SB3's default
 EPISODE = 250  # steps; about the time between lost lives in an Atari game
 BUFFER_SIZE, N_STORED = 3_000, 1_100  # transitions
-OFF, BEFORE = ", group and losses off", " (before)"
+OFF, BFLOAT16, BEFORE = ", group and losses off", ", bfloat16 targets", " (before)"
 EQR_AGENTS = ("EqRQRDQN", "EqRRainbow")
 
 
@@ -70,7 +70,7 @@ NETWORKS = {
 # Name -> class, and the convolutional extractor of its package.
 ALGORITHMS: tuple[type[Any], ...] = (DQN, QRDQN, EqRQRDQN, EqRRainbow)
 AGENTS = {algorithm.__name__: (algorithm, ConvExtractor) for algorithm in ALGORITHMS}
-AGENTS |= {name + OFF: AGENTS[name] for name in EQR_AGENTS}
+AGENTS |= {name + OFF: AGENTS[name] for name in EQR_AGENTS} | {"EqRRainbow" + BFLOAT16: AGENTS["EqRRainbow"]}
 
 
 def add_before(folder: str) -> None:
@@ -89,10 +89,10 @@ def add_before(folder: str) -> None:
     AGENTS.update({name + off + BEFORE: (getattr(package, name), extractor) for off in ("", OFF) for name in EQR_AGENTS})
 
 
-def make_env(network: str, n_envs: int = 1) -> VecEnv:
+def make_env(network: str) -> VecEnv:
     """The network's environment, with stacked frames if ``n_stack`` is above 1."""
     game = NETWORKS[network]
-    env = DummyVecEnv([game.make_game] * n_envs)
+    env = DummyVecEnv([game.make_game])
     return VecFrameStack(env, game.n_stack) if game.n_stack > 1 else env
 
 
@@ -107,6 +107,8 @@ def make_agent(
         layers["features_extractor_class"] = conv_extractor
     arguments = {"buffer_size": BUFFER_SIZE, "batch_size": settings.batch_size, "seed": 0, "device": "cpu"}
     arguments |= settings.eqr if name.startswith(EQR_AGENTS) else {}
+    if BFLOAT16 in name:
+        layers["bfloat16_targets"] = True
     if OFF in name:
         layers["group"] = None
         arguments |= {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
@@ -124,12 +126,6 @@ def make_trainable(name: str, network: str = "atari", n_updates: int = 3, **kwar
     model.learning_starts, model.exploration_rate = starts, 0.0
     model.train(n_updates, model.batch_size)
     return model
-
-
-def play(model: Any, n_steps: int) -> None:
-    """Act and store without updates, for ``n_steps`` over all environments."""
-    model.learning_starts, model.gradient_steps = 0, 0
-    model.learn(n_steps, reset_num_timesteps=False)
 
 
 def fill(buffer: Any, n_adds: int) -> None:

@@ -1,6 +1,5 @@
 """The speed script: its counts are correct, ratios are computed within rounds, and it runs completely."""
 
-import argparse
 import json
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import pytest
 import torch as th
 
 from experiments import speed, workload
-from experiments.speed import growth
 from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, Series, Table, fill, make_agent
 from sb3_eqr import EqRQRDQN
 from tests.tools.test_package import ROOT
@@ -75,14 +73,13 @@ def test_calls_are_timed_alternately():
     assert [len(numbers) for name in "ab" for numbers in timings[name]] == [3] * 6
 
 
-def test_ratios_and_growth(monkeypatch):
+def test_ratios(monkeypatch):
     ms, more = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
     fast, slow = Series(ms, ms, ms), Series(more, 3 * more, ms)
     monkeypatch.setattr(th, "get_num_threads", lambda: 1)
     assert slow.ratio(fast) == 6.0  # of CPU time
     monkeypatch.setattr(th, "get_num_threads", lambda: 2)
     assert slow.ratio(fast) == 2.0
-    assert growth([2.0, 4.0, 12.0], [1.0, 2.0, 3.0]) == [1.0, 1.0, 2.0] and growth([2.0, 1.0], [1.0, 1.0]) == [1.0, 0.5]
 
 
 def test_a_table():
@@ -94,17 +91,16 @@ def test_a_table():
 def test_options():
     args = speed.parse([])
     assert args.only == ["updates", "neighbour"] and args.network is None
-    args = speed.parse(["--only", "sizes,graph", "--network", "minatar,cartpole", "--before", str(ROOT)])
-    assert args.only == ["sizes", "graph"] and args.network == ["minatar", "cartpole"]
+    args = speed.parse(["--only", "parts,graph", "--network", "minatar,cartpole", "--before", str(ROOT)])
+    assert args.only == ["parts", "graph"] and args.network == ["minatar", "cartpole"]
 
 
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, graph, sizes, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, neighbour, graph, parts, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
-        ("--largest 100", "--largest must be an integer >= 10000, got 100"),
         ("--before nowhere", "--before must be a folder with sb3_eqr in it, got 'nowhere'"),
     ],
 )
@@ -122,7 +118,7 @@ def test_importing_another_version_together_with_this_one(monkeypatch):
     assert sys.path == path and all(sys.modules[name] is module for name, module in modules.items())
     found, now = workload.AGENTS["EqRQRDQN" + BEFORE], workload.AGENTS["EqRQRDQN"]
     assert list(now) != list(found) and [one.__name__ for one in now] == [one.__name__ for one in found]
-    assert not issubclass(found[0], EqRQRDQN) and len(workload.AGENTS) == 10
+    assert not issubclass(found[0], EqRQRDQN) and len(workload.AGENTS) == 11
     models = [make_agent(name, buffer_size=64, batch_size=4, prediction_depth=1) for name in ("EqRQRDQN", "EqRQRDQN" + BEFORE)]
     for model in models:
         fill(model.replay_buffer, 40)
@@ -147,8 +143,14 @@ def test_script_prints_its_tables(tmp_path):
         assert operations[name] == operations[name + BEFORE] > operations[name + OFF]
 
 
-@pytest.mark.slow
-def test_sizes():
-    """With small buffers."""
-    args = argparse.Namespace(rounds=1, largest=10_000, threads=1)
-    assert [table.name for table in speed.measure_sizes(args)] == ["stored_transitions", "n_envs", "M", "K", "group"]
+def test_parts():
+    """Forward: 64 windows of two passes through 4×256×((2 + 1) · 51) of QRDQN; its parts do not exceed the whole."""
+    args = speed.parse(["--network", "cartpole", "--rounds", "1", "--threads", "1"])
+    (table,) = speed.measure_parts(args)
+    stock, without, with_eqr = table.rows
+    forward = 64 * (4 * 256 + 256 * 2 * 51) * 2  # multiply and add; two actions
+    assert stock["MFLOP"] == pytest.approx(4 * forward / 1e6, rel=0.1)  # online and target forward, online backward twice
+    assert stock["MFLOP"] < without["MFLOP"] < with_eqr["MFLOP"]
+    for row in (without, with_eqr):
+        parts = [row[f"{part}_ms"] for part in ("sample", "Adam", "losses", "backward", "clip", "target")]
+        assert min(parts) > 0 and 0.5 * row["update_ms"] < sum(parts) < row["update_ms"]
