@@ -191,7 +191,7 @@ def main() -> None:
     )
     parser.add_argument("--game", default="Pong", help="any of ALE's games, or CartPole-v1")
     ours = [name for name in configuration_files() if not name.startswith(f"{STOCK}/")]
-    parser.add_argument("--config", choices=ours, default="eqr_qrdqn", help="see docs/configurations.md")
+    parser.add_argument("--config", choices=ours, default="eqr_qrdqn", help="see docs/choosing.md")
     parser.add_argument(
         "--width-scale", type=float, help="width of eqr_bbf's networks; its paper has 4, and 1 is fast enough on two cores"
     )

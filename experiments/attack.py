@@ -3,7 +3,7 @@ Attacks on the package: kills, wrong and hostile input, NaN, damaged files, a fu
 
     python -m experiments.attack                       # all, about a quarter of an hour
     python -m experiments.attack --only inputs files --kills 20
-    python -m experiments.attack --out docs/results/attack.md
+    python -m experiments.attack --out experiments/notes/attack.md
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """
 Install a fresh clone into an empty environment of each Python, run the commands of README and quickstart there, and write how
-long each takes: docs/results/installation.md.
+long each takes: experiments/notes/installation.md.
 
-    python -m experiments.installation python3.11 python3.12 python3.13 --write docs/results/installation.md
+    python -m experiments.installation python3.11 python3.12 python3.13 --write experiments/notes/installation.md
 
 Exits with 1 if a command fails. Long commands are shortened; of an argument that is given twice the last one counts.
 """

@@ -3,7 +3,7 @@ The tests of the installed versions of SB3 and sb3-contrib, run with our agents 
 EqRRainbow replaces DQN. The source archives are downloaded from the package index. Exits with 1 if a test fails and
 no reason for it is listed.
 
-    python -m experiments.peers --out docs/results/peers.md
+    python -m experiments.peers --out experiments/notes/peers.md
 """
 
 import argparse
@@ -69,7 +69,7 @@ def main() -> None:
             unexplained += reason is None
             reasons.append(f"- `{test}`: {reason or '**no reason is known**'}.")
     about = " ".join(__doc__.split("\n\n")[0].split())
-    command = "```sh\npython -m experiments.peers --out docs/results/peers.md\n```"
+    command = "```sh\npython -m experiments.peers --out experiments/notes/peers.md\n```"
     counted = markdown(["suite", "agent", "passed", "skipped", "failed"], rows)
     parts = [
         "# The tests of SB3 and sb3-contrib",

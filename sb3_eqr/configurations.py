@@ -29,7 +29,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         narrow = {"net_arch": [512], "features_extractor_kwargs": {"width_scale": 1}}
         EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf", policy_kwargs=narrow, learning_starts=500))
 
-    :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/configurations.md describes each one
+    :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/choosing.md describes each one
     :param env_id: the entry in that file: "atari", or the name of an environment
     :param changes: arguments that override those of the file; dictionaries are merged
     :return: the arguments, without what RL Zoo itself reads (``ZOO_KEYS``); warns if the entry's environment is normalised

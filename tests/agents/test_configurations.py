@@ -44,7 +44,7 @@ def rows(text):
 
 
 def test_the_tables_and_the_files_agree():
-    text = (ROOT / "docs" / "configurations.md").read_text().split("## Switches")[0]
+    text = (ROOT / "docs" / "choosing.md").read_text().split("## Switches")[0]
     of_paper, of_others = map(rows, text.split("Agents from other papers"))
     for name, arguments in of_paper.items():
         assert load_configuration("paper", **arguments) == load_configuration(name), name
