@@ -16,7 +16,6 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN, MatrixLieGroup
-from sb3_eqr.envs import register
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import action_elements, coordinate_names, coordinates, encode, frame, play, split
@@ -69,7 +68,6 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)  # small networks are slower with two
     args.out.mkdir(parents=True, exist_ok=True)
-    register()
     env = make_vec_env("SlidingBallTorus-v0", 16, args.seed)
     group = MatrixLieGroup(GENERATORS)
     model = train_representation(env, group, N_BLOCKS, total_timesteps=args.steps, seed=args.seed, device="cpu")

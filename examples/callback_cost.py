@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, load_configuration
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.envs import make_atari100k_env, register
+from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.visualize import LatentCallback
 
 
@@ -71,7 +71,6 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="PyTorch threads (default: 1)")
     args = parser.parse_args()
     th.set_num_threads(args.threads)
-    register()
     print("| agent | pictures | ms per step | ms per call | share of training |\n|---|---|---|---|---|")
     for name, (make, before, timed) in AGENTS.items():
         for pictures in (True, False):

@@ -18,7 +18,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.envs import PixelPendulum, register
+from sb3_eqr.envs import PixelPendulum
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import encode, play
@@ -80,7 +80,6 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/pendulum.jsonl"), help="output file")
     args = parser.parse_args()
     th.set_num_threads(1)  # small networks are slower with two
-    register()
     args.out.parent.mkdir(parents=True, exist_ok=True)
     for group in args.groups:
         for seed in args.seeds:

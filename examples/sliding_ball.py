@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.saving.files import atomic_write
-from sb3_eqr.envs import SlidingBall, register
+from sb3_eqr.envs import SlidingBall
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split
 
@@ -226,7 +226,6 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/sliding_ball"), help="output folder")
     args = parser.parse_args()
     th.set_num_threads(1)  # small networks are slower with two
-    register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"
     lines = results.read_text().splitlines() if results.exists() else []

@@ -19,7 +19,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.envs import register
 from sb3_eqr.representation import train_representation
 
 GOALS = {"A": [0.25, 0.25], "B": [0.75, 0.5]}
@@ -114,7 +113,6 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("results/transfer"), help="output folder")
     args = parser.parse_args()
     th.set_num_threads(1)  # small networks are slower with two
-    register()
     args.out.mkdir(parents=True, exist_ok=True)
     results = args.out / "results.jsonl"
     lines = results.read_text().splitlines() if results.exists() else []

@@ -7,20 +7,24 @@ folders of a benchmark or files of packed runs.
     python -m experiments.tables docs/results/ablation.jsonl.xz --measures score end skill --baseline recipe --ratio
     python -m experiments.tables docs/results/atari100k/gpu.jsonl.xz --games Boxing --measures 0-20000 20000-40000
     python -m experiments.tables docs/results/worlds.jsonl.xz --games torus_of_4 torus_of_8 --figure goals distractors.png
+    python -m experiments.tables docs/results --differences differences.png
     python -m experiments.tables --published
 
 Cells are means ± standard errors over seeds, with ``--each`` the seeds themselves. With ``--baseline`` they also have the
-difference of the means, or with ``--ratio`` the ratio averaged over games, and its 95 % interval.
+difference of the means, or with ``--ratio`` the ratio averaged over games, and its 95% interval. Figures are 3.9 inches wide,
+so that their letters can be read on a screen of 390 pixels.
 """
 
 import argparse
 import pathlib
+import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 from scipy.stats import t as student
 from scipy.stats import ttest_ind
 
@@ -28,18 +32,59 @@ from experiments import markdown
 from sb3_eqr.benchmark.packed import read
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.benchmark.scores import evaluation_curve, normalised
-from sb3_eqr.plot_style import looks, styled
+from sb3_eqr.plot_style import COLORS, GREY, looks, styled
 
 Row = dict[str, Any]
 PARTS = 10  # of a run, for the return at its end and for figures
+WIDTH, DPI = 3.9, 200  # of figures, in inches and dots per inch
+AXES = {
+    "score": "mean score of the evaluation episodes",
+    "return": "mean return in training",
+    "goals": "goals reached per tenth of the run",
+}
+TITLES = {"torus_of_4": "4 distractors", "torus_of_8": "8 distractors", "large_torus": "large torus"}
+VERDICTS = {  # colour and marker of each
+    "better with EqR": (COLORS[0], "^"),
+    "no clear difference": (GREY, "o"),
+    "worse with EqR": (COLORS[1], "v"),
+}
+MINATAR = ["Breakout", "SpaceInvaders", "Asterix", "Freeway", "Seaquest"]
+DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
+ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
+COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [  # the arguments of ``compare``
+    ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
+    ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
+    ("Large torus", ["worlds.jsonl.xz"], ["large_torus"], DEFAULTS, "goals", "worlds.md#a-large-torus"),
+    ("Pendulum", ["worlds.jsonl.xz"], ["pendulum"], DEFAULTS, "return", "worlds.md#a-pendulum"),
+    ("Atari Boxing", ATARI, ["Boxing"], DEFAULTS_OFF, "56000-76000", "../atari100k.md"),
+    ("Atari Breakout", ATARI, ["Breakout"], DEFAULTS_OFF, "40000-60000", "../atari100k.md"),
+    ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
+    ("LunarLander", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:off"), "score", "zoo.md"),
+    ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
+    *(
+        (
+            f"{name}, {agent}",
+            ["minatar_30k_final.jsonl.xz"],
+            games,
+            (agent.lower(), f"{agent.lower()}:{off}"),
+            "score",
+            "minatar.md",
+        )
+        for agent, off in (("EqR_Rainbow", "rainbow"), ("EqR_QRDQN", "qrdqn"))
+        for name, games in [*((game, [game]) for game in MINATAR), ("MinAtar, mean", MINATAR)]
+    ),
+]
 
 
 def series(row: Row, what: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    :param what: "return" of episodes in training, "goals" (episodes with a positive return), or a logged key such as
-        "aet_loss" or "latent/skill"
-    :return: steps at the ends of ``PARTS`` parts of the run, and means in them ("goals": numbers), NaN where there is none
+    :param what: "score" of evaluations, "return" of episodes in training, "goals" (episodes with a positive return), or a
+        logged key such as "aet_loss" or "latent/skill"
+    :return: steps at the ends of ``PARTS`` parts of the run, and means in them ("goals": numbers), NaN where there is none;
+        "score": those of the evaluations
     """
+    if what == "score":
+        return evaluation_curve(row)
     edges = np.linspace(0, row["protocol"]["steps"], PARTS + 1)
     if what in (kept := row.get("tenths", {})):
         return edges[1:][-len(kept[what]) :], np.array(kept[what])
@@ -77,7 +122,8 @@ MEASURES: dict[str, Callable[[Row], float]] = {
 def measure(row: Row, name: str) -> float:
     """
     :param name: a key of ``MEASURES``; "20000-40000", the mean return of the training episodes that ended in these steps;
-        "at475", the step of the first evaluation of at least 475; or "train/KEY", the last value of a logged key
+        "at475", the step of the first evaluation of at least 475; "until10000", the mean of the evaluations up to this step;
+        or "train/KEY", the last value of a logged key
     :return: its value, NaN if the run does not have it; what was measured when the run was made comes first
     """
     if name in row.get("measures", {}):
@@ -86,9 +132,12 @@ def measure(row: Row, name: str) -> float:
         return float(MEASURES[name](row))
     if name.startswith("train/"):
         return float(last(row, name[6:]))
-    if name.startswith("at"):
+    if name.startswith(("at", "until")):
         steps, scores = evaluation_curve(row)
-        return float(min(steps[scores >= float(name[2:])], default=np.nan))
+        limit = float(name.removeprefix("until").removeprefix("at"))
+        if name.startswith("until"):
+            return float(scores[steps <= limit].mean())
+        return float(min(steps[scores >= limit], default=np.nan))
     first, end = map(int, name.split("-"))
     steps, scores = np.array(row["training"]["step"]), np.array(row["training"]["score"])
     found = scores[(first < steps) & (steps <= end)]
@@ -107,7 +156,7 @@ def mean_and_error(values: np.ndarray) -> str:
 
 
 def difference(values: np.ndarray, other: np.ndarray) -> str:
-    """The difference of two means and its 95 % interval (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28)."""
+    """The difference of two means and its 95% interval (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28)."""
     if min(len(values), len(other)) < 2 or max(np.ptp(values), np.ptp(other)) == 0:
         return ""
     found = ttest_ind(values, other, equal_var=False).confidence_interval()
@@ -116,7 +165,7 @@ def difference(values: np.ndarray, other: np.ndarray) -> str:
 
 def ratio(changed: np.ndarray, entry: np.ndarray) -> tuple[float, float, float]:
     """
-    The ratio of two agents' means over seeds, averaged over games, and its 95 % interval: variances of the means by the delta
+    The ratio of two agents' means over seeds, averaged over games, and its 95% interval: variances of the means by the delta
     method, degrees of freedom as in Welch's t test. A bootstrap of five seeds would be too narrow.
 
     :param changed: (seeds, games)
@@ -167,27 +216,124 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
     return markdown(header, lines)
 
 
-def draw(rows: list[Row], what: str, path: pathlib.Path) -> None:
+def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | None = None) -> None:
     """
-    Draw a series along training, a panel per game: means over seeds, and the range of the seeds as a band.
+    Draw a series along training, a panel per game: means over seeds, and their 95% intervals as a band.
 
     :param what: see :func:`series`
+    :param labels: of the agents, in order of appearance (default: their names)
     """
     games, agents = unique(rows, "game"), unique(rows, "agent")
+    n_columns, n_rows = min(len(games), 2), (len(games) + 1) // 2
+    names = dict(zip(agents, labels or agents, strict=True))
     with styled():
-        figure, axes = plt.subplots(1, len(games), figsize=(4 * len(games), 3.2), layout="constrained", squeeze=False)
-        for axis, game in zip(axes[0], games, strict=True):
+        figure, axes = plt.subplots(
+            n_rows, n_columns, figsize=(WIDTH, 1.7 * n_rows + 0.9), layout="constrained", squeeze=False, sharex="col"
+        )
+        for axis, game in zip(axes.flat, games, strict=False):
             for agent, look in looks(agents).items():
                 found = [series(row, what) for row in rows if (row["agent"], row["game"]) == (agent, game)]
                 if found:
                     steps, runs = found[0][0] / 1_000, np.array([values for _, values in found])
-                    axis.plot(steps, runs.mean(axis=0), look.marker, ls=look.line, color=look.color, label=agent)
-                    axis.fill_between(steps, runs.min(axis=0), runs.max(axis=0), color=look.color, alpha=0.15, lw=0)
-            axis.set(title=game, xlabel="steps (thousands)", ylabel=what)
-        lines = {str(line.get_label()): line for axis in axes[0] for line in axis.get_lines()}
-        figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=3)
-        figure.savefig(path, dpi=150, metadata={"Software": None})
+                    mean, width = runs.mean(axis=0), np.zeros(len(steps))
+                    if len(runs) > 1:
+                        width = student.ppf(0.975, len(runs) - 1) * runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
+                    axis.plot(steps, mean, look.marker, ls=look.line, color=look.color, label=names[agent])
+                    axis.fill_between(steps, mean - width, mean + width, color=look.color, alpha=0.15, lw=0)
+            axis.set(title=TITLES.get(game, game), xlim=(0, None))
+            axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+            axis.grid(axis="y")
+        for axis in axes.flat[len(games) :]:
+            axis.set_axis_off()
+            axes[-2, -1].tick_params(labelbottom=True)  # nothing is below it
+        lines = {str(line.get_label()): line for axis in axes.flat for line in axis.get_lines()}
+        figure.supxlabel("training steps (thousands)", fontsize="medium")
+        figure.supylabel(AXES.get(what, what), fontsize="medium")
+        figure.legend(list(lines.values()), list(lines), loc="outside upper center")
+        figure.savefig(path, dpi=DPI, metadata={"Software": None})
         plt.close(figure)
+
+
+class Compared(NamedTuple):
+    """A task with EqR and without it: means, the 95% interval of their difference, the pooled standard deviation of seeds."""
+
+    task: str
+    steps: int
+    means: tuple[float, float]
+    ends: tuple[float, float]
+    spread: float
+    seeds: int
+    page: str
+
+    @property
+    def difference(self) -> float:
+        """Positive if EqR is better."""
+        return self.means[0] - self.means[1]
+
+    @property
+    def verdict(self) -> str:
+        """A key of ``VERDICTS``."""
+        better, none, worse = VERDICTS
+        return better if self.ends[0] > 0 else worse if self.ends[1] < 0 else none
+
+
+def compare(
+    folder: pathlib.Path, task: str, files: list[str], games: list[str], agents: tuple[str, str], name: str, page: str
+) -> Compared:
+    """
+    :param games: if there are several, normalised scores are averaged over them, seed by seed
+    :param agents: with EqR and without it
+    :param name: see :func:`measure`
+    """
+    both: list[np.ndarray] = []
+    runs = [read(folder / file) for file in files]
+    for agent in agents:
+        found = {(r["seed"], r["game"]): r for _, rows in runs for r in rows if r["agent"] == agent and r["game"] in games}
+        scores = pd.Series({run: measure(row, name) for run, row in found.items()}).unstack()[games]
+        if len(games) > 1:
+            bounds = runs[0][0].normalisation.scores
+            scores = scores.apply(lambda column, bounds=bounds: normalised(column, bounds[column.name]))
+        both.append(scores.mean(axis=1).to_numpy())
+    numbers, (low, high) = re.findall(r"\d+", name), ttest_ind(*both, equal_var=False).confidence_interval()
+    steps = int(numbers[-1]) if numbers else next(iter(found.values()))["protocol"]["steps"]
+    spread = np.sqrt(np.mean([values.var(ddof=1) for values in both]))
+    means = float(both[0].mean()), float(both[1].mean())
+    return Compared(task.replace("EqR_", "EqR"), steps, means, (low, high), float(spread), min(map(len, both)), page)
+
+
+def forest(found: list[Compared], path: pathlib.Path) -> None:
+    """Draw the differences, in standard deviations over seeds."""
+    with styled():
+        figure, axis = plt.subplots(figsize=(WIDTH, 0.235 * len(found) + 1.2), layout="constrained")
+        for i, one in enumerate(found):
+            color, marker = VERDICTS[one.verdict]
+            low, middle, high = (value / one.spread for value in (one.ends[0], one.difference, one.ends[1]))
+            axis.plot([low, high], [i, i], color=color, lw=1.6)
+            axis.plot(middle, i, marker, color=color, label=one.verdict)
+        labels = [f"{one.task} ({one.seeds})" for one in found]
+        axis.set_yticks(range(len(found)), labels, fontsize=8)
+        axis.set(ylim=(len(found) - 0.4, -0.6))
+        axis.set_xlabel("with EqR minus without,\nin standard deviations over seeds", loc="right")
+        axis.axvline(0, color=GREY, lw=0.7)
+        axis.grid(axis="x")
+        lines = {str(line.get_label()): line for line in axis.get_lines() if line.get_label() in VERDICTS}
+        shown = [verdict for verdict in VERDICTS if verdict in lines]
+        figure.legend([lines[verdict] for verdict in shown], shown, loc="outside upper right", ncols=1, handlelength=1)
+        figure.savefig(path, dpi=DPI, metadata={"Software": None})
+        plt.close(figure)
+
+
+def differences(found: list[Compared]) -> str:
+    """:return: Markdown, without spaces beside the bars"""
+    lines = []
+    for one in found:
+        largest = max(map(abs, one.ends))
+        digits = 0 if largest >= 20 else 1 if largest >= 1 else 2
+        cells = [f"{value:,.{digits}f}".replace("-", "−") for value in (*one.means, one.difference, *one.ends)]
+        shown = [f"[{one.task}]({one.page})", f"{one.steps:,}", str(one.seeds), *cells[:2]]
+        lines.append([*shown, f"{cells[2]} [{cells[3]}, {cells[4]}]", one.verdict])
+    header = ["task", "steps", "seeds", "with EqR", "without", "difference", "verdict"]
+    return re.sub(r" ?\| ?", "|", markdown(header, lines))
 
 
 def published() -> str:
@@ -215,10 +361,19 @@ def main() -> None:
     parser.add_argument("--each", action="store_true", help="print the seeds")
     drawn = "draw return, goals, aet_loss, ... along training"
     parser.add_argument("--figure", nargs=2, metavar=("SERIES", "FILE"), help=drawn)
+    parser.add_argument("--labels", nargs="+", help="of the agents in the figure, in words")
+    every = "a file: draw what EqR changes on every task of COMPARED, whose runs are in the given folder, and print a table"
+    parser.add_argument("--differences", type=pathlib.Path, metavar="FILE", help=every)
     parser.add_argument("--published", action="store_true", help="print the last rows of the paper's tables")
     args = parser.parse_args()
     if args.published:
         print(published())
+        return
+    if args.differences:
+        compared = [compare(args.files[0], *arguments) for arguments in COMPARED]
+        compared.sort(key=lambda one: -one.difference / one.spread)
+        forest(compared, args.differences)
+        print(differences(compared))
         return
     rows = [row for file in args.files for row in read(file)[1]]
     full = {name: agent for agent in unique(rows, "agent") for name in (agent, agent.partition(":")[2])}
@@ -230,7 +385,7 @@ def main() -> None:
     if args.agents:
         rows.sort(key=lambda row: wanted.index(row["agent"]))
     if args.figure:
-        draw(rows, args.figure[0], pathlib.Path(args.figure[1]))
+        draw(rows, args.figure[0], pathlib.Path(args.figure[1]), args.labels)
     else:
         print(table(rows, args.measures, full.get(args.baseline, args.baseline), args.ratio, args.each))
 

@@ -1,5 +1,6 @@
 """EqR: equivariant representations for data-efficient reinforcement learning, on Stable-Baselines3."""
 
+from sb3_eqr import envs as envs  # registers its environments
 from sb3_eqr.common.groups import MatrixLieGroup, make_group
 from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer

@@ -20,7 +20,7 @@ from sb3_eqr.benchmark.runs import RESULT, Run, Settings, plan_runs
 from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
-from sb3_eqr.envs import ResumableWrapper, make_atari100k_env, register
+from sb3_eqr.envs import ResumableWrapper, make_atari100k_env
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 
 STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints per second
@@ -149,7 +149,6 @@ WORLDS: dict[str, Callable[..., VecEnv]] = {
 
 def train_in(agent: str, world: str, n_envs: int, folder: pathlib.Path) -> None:
     """Train an agent to the end, or resume it from the checkpoint in ``folder``, and save it there."""
-    register()
     name, env = "resumed" if find_checkpoints(folder) else "whole", WORLDS[world](n_envs=n_envs)
     options: dict[str, Any] = {"buffer_size": 2_000, "batch_size": 8, "learning_starts": 40, "n_steps": 3, "train_freq": 4}
     if not world.startswith("CartPole"):

@@ -9,7 +9,6 @@ import yaml
 from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError, field_validator, model_validator
 
-from sb3_eqr import envs
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.files import atomic_write
@@ -187,7 +186,6 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: i
     :param episodes: episodes of the final evaluation that override the suite's
     :raises ValueError: for a game that the suite or gymnasium does not have, with the nearest name
     """
-    envs.register()
     wanted = suite.games if games is None else games
     for game in wanted:
         if game.lower() not in map(str.lower, suite.games):

@@ -1,6 +1,6 @@
 """
-Environments. Importing this package needs no extra; creating an Atari environment needs ``pip install ".[atari]"`` in a clone
-of the repository.
+Environments. Importing ``sb3_eqr`` registers those below and MinAtar's games with gymnasium, and needs no extra. Creating an
+Atari environment needs ``pip install ".[atari]"`` in a clone of the repository, MinAtar's games ``pip install minatar``.
 """
 
 import importlib
@@ -17,11 +17,13 @@ from sb3_eqr.envs.pixel_pendulum import PixelPendulum
 from sb3_eqr.envs.sliding_ball import SlidingBall
 from sb3_eqr.envs.star_field import StarField
 
-# Keyword arguments for gymnasium.register.
+# Keyword arguments for gymnasium.register. The goal in fractions of the loop, along both axes.
+DISTRACTORS = {"dimensions": 2, "goal": [0.25, 0.25], "n_distractors": 8}
 WORLDS: dict[str, dict[str, Any]] = {
     "BlindCliffwalk-v0": {"entry_point": "sb3_eqr.envs:BlindCliffwalk"},
     "SlidingBall-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100},
     "SlidingBallTorus-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100, "kwargs": {"dimensions": 2}},
+    "SlidingBallDistractors-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100, "kwargs": DISTRACTORS},
     "PixelPendulum-v0": {"entry_point": "sb3_eqr.envs:PixelPendulum", "max_episode_steps": 200},
     "StarField-v0": {"entry_point": "sb3_eqr.envs:StarField", "max_episode_steps": 100},
     "StarFieldRotations-v0": {
@@ -32,11 +34,9 @@ WORLDS: dict[str, dict[str, Any]] = {
 }
 
 
-def register() -> None:
-    """Register the environments above and MinAtar's games with gymnasium (MinAtar needs ``pip install minatar``)."""
-    for env_id, arguments in {**WORLDS, **minatar.WORLDS}.items():
-        if env_id not in gym.registry:
-            gym.register(env_id, **arguments)
+for env_id, arguments in {**WORLDS, **minatar.WORLDS}.items():
+    if env_id not in gym.registry:
+        gym.register(env_id, **arguments)
 
 
 def import_packages(packages: Iterable[str]) -> None:
@@ -51,4 +51,4 @@ def import_packages(packages: Iterable[str]) -> None:
             ) from error
 
 
-__all__ = ["BlindCliffwalk", "PixelPendulum", "ResumableWrapper", "SlidingBall", "StarField", "make_atari100k_env", "register"]
+__all__ = ["BlindCliffwalk", "PixelPendulum", "ResumableWrapper", "SlidingBall", "StarField", "make_atari100k_env"]

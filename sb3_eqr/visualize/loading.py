@@ -81,7 +81,6 @@ def make_env(
     :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
     :raises ImportError: if RL Zoo or the environment is not installed
     """
-    sb3_eqr.envs.register()
     kwargs = env_kwargs or {}
     folders = [file.parent for file in sorted(path.parent.glob("*/args.yml")) if (file.parent / "config.yml").is_file()]
     arguments = _zoo_arguments(folders[0], trust, packages) if folders else {}

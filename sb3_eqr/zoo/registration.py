@@ -6,7 +6,7 @@ from typing import Any
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
-from sb3_eqr import AGENTS, envs
+from sb3_eqr import AGENTS
 
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 
@@ -70,7 +70,7 @@ def sample_eqr_params(
 
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     """
-    Register the agents and their search spaces with RL Zoo, and the package's environments with gymnasium.
+    Register the agents and their search spaces with RL Zoo.
 
     :param policy_kwargs: ``policy_kwargs`` that a search does not change
     """
@@ -80,7 +80,6 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
         sampler = partial(sample_eqr_params, categorical=name == "eqr_rainbow", kept=kept)
         HYPERPARAMS_SAMPLER[name] = sampler  # type: ignore[assignment]
         HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
-    envs.register()
 
 
 def trust_files(algo: str) -> None:

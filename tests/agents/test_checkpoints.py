@@ -14,14 +14,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
 import sb3_eqr
-from sb3_eqr import EqRQRDQN, MatrixLieGroup, envs
+from sb3_eqr import EqRQRDQN, MatrixLieGroup
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback, find_checkpoints, write_checkpoint
 from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.models import same
 from tests.toys import ChainEnv, SampledEnv
 
-envs.register()
 STEPS = 160
 SMALL = {"buffer_size": 300, "batch_size": 8, "learning_starts": 40, "n_steps": 3, "seed": 3, "device": "cpu"}
 SMALL["policy_kwargs"] = {"net_arch": [8], "n_blocks": 2, "latent_hidden_dim": 8}

@@ -16,7 +16,6 @@ from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import GAMES, ChannelsFirstImage
 from tests.toys import ChainEnv, DictEnv, ImageEnv
 
-envs.register()
 TORUS = {"goal": [0.5, 0.5], "n_distractors": 2}
 
 

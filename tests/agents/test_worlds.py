@@ -22,7 +22,6 @@ CHANNELS = dict(zip(IDS, [1, 1, 2, 3, 3], strict=True))
 N_ACTIONS = dict(zip(IDS, [2, 4, 3, 12, 6], strict=True))
 FORWARD, BACK, RIGHT, LEFT, UP, DOWN = range(6, 12)
 
-envs.register()
 on_every_world = pytest.mark.parametrize("env_id", IDS)
 
 

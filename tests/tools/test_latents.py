@@ -9,7 +9,6 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage
 
-import sb3_eqr.envs
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.saving.plain_data import encode as encode_plain
 from sb3_eqr.common.saving.random_state import get_rng_state
@@ -22,7 +21,6 @@ from sb3_eqr.visualize.pictures import latent_figure
 from tests.tools.test_package import ROOT
 from tests.toys import ChainEnv
 
-sb3_eqr.envs.register()
 BALL = {"group": "SO(2)", "n_blocks": 1, "parameterization": "gram-schmidt", "whiten": True}
 
 

@@ -20,7 +20,7 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, cli, envs, zoo
+from sb3_eqr import EqRQRDQN, EqRRainbow, cli, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain
@@ -416,7 +416,6 @@ def test_pushing_to_the_hub_and_loading_from_it(sb3_eqr, tmp_path, monkeypatch):
 @pytest.mark.parametrize("env_id", ["MinAtar/Breakout-v1", "BlindCliffwalk-v0"])
 def test_environments_can_be_rendered(env_id):
     """Every frame is uint8 and not blank."""
-    envs.register()
     env = gym.make(env_id, render_mode="rgb_array")
     if env_id.startswith("MinAtar"):
         env = ChannelsFirstImage(env)
@@ -446,7 +445,6 @@ def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
 
 def test_minatar_is_deterministic_with_a_seed():
     """The seed determines the game."""
-    envs.register()
     games = []
     for seed in (5, 5, 6):
         env = gym.make("MinAtar/Asterix-v1")

@@ -12,7 +12,15 @@ from sb3_eqr import zoo
 from sb3_eqr.configurations import configuration_files
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
-ENVIRONMENTS = {"atari", "CartPole-v1", "LunarLander-v3", "MountainCar-v0", "Acrobot-v1", "BlindCliffwalk-v0"}
+ENVIRONMENTS = {
+    "atari",
+    "CartPole-v1",
+    "LunarLander-v3",
+    "MountainCar-v0",
+    "Acrobot-v1",
+    "BlindCliffwalk-v0",
+    "SlidingBallDistractors-v0",
+}
 ENVIRONMENTS |= {f"MinAtar/{game}-v1" for game in GAMES}
 ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
 GENERIC = {"default", "default-image", "default-small-image", "default-dict"}  # test_zoo.py trains by them
