@@ -6,7 +6,7 @@ GAME ?=
 CONFIG ?= eqr_qrdqn
 ARGS ?=
 STEPS ?=
-DEMO = OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" SDL_VIDEODRIVER=dummy $(BIN)/python examples/demo.py
+DEMO = OMP_WAIT_POLICY="$${OMP_WAIT_POLICY:-PASSIVE}" SDL_VIDEODRIVER=dummy $(BIN)/python
 
 .PHONY: demo tutorials quick test pytest slow format lint type commit-checks doc dist clean
 
@@ -15,10 +15,14 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
-# CartPole, about two minutes, then a game; `make demo GAME=Boxing` is the game alone.
+# The pictures of the README, in less than five minutes on two idle cores; `make demo GAME=Boxing` is a game of Atari.
 demo: $(VENV)/installed
-	$(if $(GAME),,$(DEMO) --game CartPole-v1)
-	$(DEMO) --game "$(or $(GAME),Pong)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
+ifeq ($(GAME),)
+	$(DEMO) examples/sliding_ball.py --out demo_results/ball
+	$(DEMO) examples/distractors.py
+else
+	$(DEMO) examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
+endif
 
 test: lint type pytest
 

@@ -43,14 +43,17 @@ autodoc_mock_imports = [name for name in ("ale_py", "cv2", "yaml") if importlib.
 copybutton_exclude = ".linenos, .gp, .go"  # comments in commands are copied, prompts and outputs are not
 
 
-def unlink_folders(app, docname, source):
+def unlink_outside(app, docname, source):
     """
-    Links to files outside docs/ become downloads by themselves. A link to a folder works on GitHub only: here its text stays.
+    Links to files outside docs/ become downloads by themselves. A link to a folder or a page there works on GitHub only: here
+    its text stays.
     """
     folder = (DOCS / docname).parent
 
     def text_of(match: re.Match) -> str:
-        return match[1] if (folder / match[2]).is_dir() else match[0]
+        target = (folder / match[2]).resolve()
+        is_outside = not target.is_relative_to(DOCS)
+        return match[1] if is_outside and (target.is_dir() or target.suffix == ".md") else match[0]
 
     source[0] = re.sub(r"\[([^\]]+)\]\((\.\./[^)#]*)\)", text_of, source[0])
 
@@ -62,5 +65,5 @@ def escape_shapes(app, what, name, obj, options, lines):
 
 def setup(app):
     """Called by Sphinx."""
-    app.connect("source-read", unlink_folders)
+    app.connect("source-read", unlink_outside)
     app.connect("autodoc-process-docstring", escape_shapes)

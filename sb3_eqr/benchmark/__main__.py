@@ -1,18 +1,21 @@
 """The command line: ``sb3-eqr benchmark run|status|report|pack``. The help needs none of the extra's packages."""
 
-import argparse
 import importlib
 import pathlib
 import sys
 
+from sb3_eqr.common.checks.arguments import SuggestingParser
+
 SEEDS = 5  # default
+EXAMPLE = "example: sb3-eqr benchmark run results/first --suite smoke --agents eqr_qrdqn eqr_qrdqn:off --seeds 2"
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> SuggestingParser:
     """:return: the parser of the commands"""
-    parser = argparse.ArgumentParser(prog="sb3-eqr benchmark", description="Compare agents by the scores of several seeds.")
+    parser = SuggestingParser(prog="sb3-eqr benchmark", description="Compare agents by the scores of several seeds.")
     commands = parser.add_subparsers(dest="command", required=True)
-    run = commands.add_parser("run", help="train and evaluate agents on a suite; the same command resumes where it stopped")
+    about = "train and evaluate agents on a suite; the same command resumes where it stopped"
+    run = commands.add_parser("run", help=about, description=about, epilog=EXAMPLE)
     # An absolute path is valid on every machine of a cluster.
     run.add_argument("folder", type=lambda path: pathlib.Path(path).resolve(), help="output folder")
     run.set_defaults(default_seeds=SEEDS)  # apart from --seeds, which shows whether it was given

@@ -9,6 +9,7 @@ import gymnasium as gym
 from matplotlib.figure import Figure
 
 from sb3_eqr import AGENTS
+from sb3_eqr.common.checks.arguments import SuggestingParser
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
@@ -23,7 +24,7 @@ FLAGS = {"n_steps": "--steps", "depth": "--depth", "env": "--env"}  # argument o
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the command."""
-    parser = argparse.ArgumentParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
+    parser = SuggestingParser(prog="sb3-eqr visualize", description="Show what an agent's latent model has learned.")
     parser.add_argument("model", type=pathlib.Path, metavar="MODEL", help="a .zip file written by an agent's save")
     parser.add_argument("--env", help="gymnasium id (default: from RL Zoo's files next to MODEL)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="packages that register environments with gymnasium")

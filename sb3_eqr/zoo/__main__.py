@@ -30,7 +30,6 @@ from sb3_eqr.zoo.resuming import FOLDER, ResumableExperiment, checkpoints_of, co
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
 SCRIPTS = ("record_video", "push_to_hub", "load_from_hub")
 COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
-ALL_COMMANDS = (*COMMANDS, "benchmark", "visualize")
 LOADING = ("enjoy", "record_video", "push_to_hub")
 # Errors of RL Zoo that may have a cause which the user can remove.
 MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, OSError)
@@ -43,12 +42,6 @@ EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas",
 RESUMING = """train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's
 folder, and --resume FOLDER, which resumes a run from its last one; add --trust if its settings contain Python objects
 """
-USAGE = f"""usage: sb3-eqr {{{",".join(ALL_COMMANDS)}}} ...
-
-All commands except the last two take RL Zoo's arguments: sb3-eqr train --help
-{RESUMING}benchmark compares agents over games and seeds: sb3-eqr benchmark --help
-visualize shows what a saved agent has learned: sb3-eqr visualize --help
-push_to_hub also takes --dry-run, which builds the folder hub/ and uploads nothing. sb3-eqr --version prints the version."""
 
 
 def find_hyperparameters(algo: str, conf_file: str | None) -> str | None:
@@ -287,13 +280,8 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """The command line."""
-    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
-        print(USAGE)
-        return
+    """Run the command that the first argument names; ``sb3_eqr.cli`` checks it."""
     command, arguments = sys.argv[1], sys.argv[2:]
-    if command not in COMMANDS:
-        fail(f"The command must be one of {', '.join(ALL_COMMANDS)}, got {command!r}.{nearest(command, ALL_COMMANDS)}")
     register()
     if command.endswith("_hub"):
         from sb3_eqr.zoo import hub

@@ -24,7 +24,7 @@ from sb3_eqr import EqRQRDQN, EqRRainbow, cli, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain
-from sb3_eqr.zoo.__main__ import find_hyperparameters
+from sb3_eqr.zoo.__main__ import COMMANDS, find_hyperparameters
 from sb3_eqr.zoo.entries import entry_name
 from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
 from tests.toys import ChainEnv, DictEnv, ImageEnv
@@ -459,8 +459,19 @@ def test_the_command_without_rl_zoo(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("sb3_eqr.zoo")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rl_zoo3.import_envs", None)
+    monkeypatch.setattr(sys, "argv", ["sb3-eqr", "train"])
     with pytest.raises(SystemExit, match=r'sb3-eqr: .*pip install "\.\[zoo\]" in a clone of the repository'):
         cli.main()
+
+
+def test_the_help_lists_every_command(sb3_eqr, monkeypatch):
+    """With what it does; an unknown command or option gets the closest one."""
+    lines = [line for line in sb3_eqr("--help").out.splitlines() if line.startswith("  ")]
+    assert [line.split()[0] for line in lines[:-2]] == [*COMMANDS, "benchmark", "visualize"]
+    monkeypatch.setattr(sys, "argv", ["sb3-eqr", "tran"])
+    with pytest.raises(SystemExit, match=r"must be one of train, enjoy.*got 'tran'\. Did you mean 'train'\?"):
+        cli.main()
+    assert "--agets a. Did you mean '--agents'?" in sb3_eqr("benchmark run x --agets a", code=2).err
 
 
 def test_plots_with_a_stock_agent(sb3_eqr, tmp_path, monkeypatch):

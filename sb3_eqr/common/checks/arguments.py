@@ -1,10 +1,11 @@
 """The legal values of all arguments, in tables that the constructors, the tests and the documentation use."""
 
+import argparse
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import torch as th
@@ -189,6 +190,21 @@ def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
     """The end of a message: a question with the closest legal name, or "" if none has at least the similarity ``cutoff``."""
     found = get_close_matches(name, list(legal), n=1, cutoff=cutoff)
     return f" Did you mean {found[0]!r}?" if found else ""
+
+
+class SuggestingParser(argparse.ArgumentParser):
+    """A parser whose error for an unknown option names the closest one."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and message, and exit with 2."""
+        unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
+        super().error(f"{message}.{nearest(unknown, self._all_options())}" if unknown else message)
+
+    def _all_options(self) -> list[str]:
+        """Its options and those of its commands."""
+        options = [option for action in self._actions for option in action.option_strings]
+        commands = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return options + [option for action in commands for one in action.choices.values() for option in one._all_options()]
 
 
 def check(name: str, value: Any, rule: Rule) -> None:
