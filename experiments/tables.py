@@ -56,8 +56,8 @@ COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [ 
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Large torus", ["worlds.jsonl.xz"], ["large_torus"], DEFAULTS, "goals", "worlds.md#a-large-torus"),
     ("Pendulum", ["worlds.jsonl.xz"], ["pendulum"], DEFAULTS, "return", "worlds.md#a-pendulum"),
-    ("Atari Boxing", ATARI, ["Boxing"], DEFAULTS_OFF, "56000-76000", "../atari100k.md"),
-    ("Atari Breakout", ATARI, ["Breakout"], DEFAULTS_OFF, "40000-60000", "../atari100k.md"),
+    ("Atari Boxing", ATARI, ["Boxing"], DEFAULTS_OFF, "56000-76000", "atari100k.md"),
+    ("Atari Breakout", ATARI, ["Breakout"], DEFAULTS_OFF, "40000-60000", "atari100k.md"),
     ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
     ("LunarLander", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:off"), "score", "zoo.md"),
     ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
@@ -241,7 +241,7 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
                     axis.plot(steps, mean, look.marker, ls=look.line, color=look.color, label=names[agent])
                     axis.fill_between(steps, mean - width, mean + width, color=look.color, alpha=0.15, lw=0)
             axis.set(title=TITLES.get(game, game), xlim=(0, None))
-            axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+            axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             axis.grid(axis="y")
         for axis in axes.flat[len(games) :]:
             axis.set_axis_off()
@@ -329,10 +329,11 @@ def differences(found: list[Compared]) -> str:
     for one in found:
         largest = max(map(abs, one.ends))
         digits = 0 if largest >= 20 else 1 if largest >= 1 else 2
-        cells = [f"{value:,.{digits}f}".replace("-", "−") for value in (*one.means, one.difference, *one.ends)]
+        numbers = (*one.means, one.difference, *one.ends)
+        cells = [f"{value + 1e-9:,.{digits}f}".replace("-", "−") for value in numbers]  # 0.285 is 0.29
         shown = [f"[{one.task}]({one.page})", f"{one.steps:,}", str(one.seeds), *cells[:2]]
         lines.append([*shown, f"{cells[2]} [{cells[3]}, {cells[4]}]", one.verdict])
-    header = ["task", "steps", "seeds", "with EqR", "without", "difference", "verdict"]
+    header = ["task", "steps", "seeds", "with EqR", "without", "difference, 95% CI", "verdict"]
     return re.sub(r" ?\| ?", "|", markdown(header, lines))
 
 

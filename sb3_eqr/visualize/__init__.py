@@ -1,5 +1,5 @@
 """
-Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metrics and figures (docs/visualize.md),
+Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metrics and figures (docs/latent_states.md),
 ``diagnose`` computes the metrics, ``LatentCallback`` logs them during training, ``record`` writes an animation. Needs
 ``pip install ".[visualize]"`` in a clone of the repository.
 

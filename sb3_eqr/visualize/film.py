@@ -70,7 +70,7 @@ def record(
     """
     Write a video of the agent: the environment on the left, a panel per block of the latent state on the right, as it is and
     as the latent model predicted it ``depth`` steps before, from the latent state then and the actions since (see
-    docs/visualize.md). All random generators keep their states.
+    docs/latent_states.md). All random generators keep their states.
 
     :param model: any EqR agent; its latent model predicts only if it was trained (``prediction_depth`` > 0)
     :param env: preprocessed as in training, but not the training environment itself; a VecNormalize with ``training=False``.

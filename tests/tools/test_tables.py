@@ -1,12 +1,26 @@
 """The tables of docs/results: differences, ratios and measures by hand."""
 
 import json
+import pathlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import t
 
-from experiments.tables import difference, draw, measure, ratio, series, table
+from experiments.tables import (
+    COMPARED,
+    Compared,
+    compare,
+    difference,
+    differences,
+    draw,
+    forest,
+    measure,
+    ratio,
+    series,
+    table,
+)
 from sb3_eqr.benchmark.packed import read
 from tests.tools.test_package import ROOT
 
@@ -20,8 +34,8 @@ def row(agent="a", game="Boxing", seed=0, score=1.0, **changes):
 
 
 def test_measures_by_hand():
-    names = ("score", "end", "goals", "first_goal", "return", "minutes", "20-60", "at9")
-    assert [measure(row(), name) for name in names] == [1.0, 4.0, 2.0, 25.0, 1.5, 1.0, 1.0, 50.0]
+    names = ("score", "end", "goals", "first_goal", "return", "minutes", "20-60", "at9", "until50", "until100")
+    assert [measure(row(), name) for name in names] == [1.0, 4.0, 2.0, 25.0, 1.5, 1.0, 1.0, 50.0, 9.0, 5.0]
     assert (
         np.isnan(measure(row(stopped_at=59), "20-60")) and np.isnan(measure(row(), "R2")) and np.isnan(measure(row(), "at10"))
     )
@@ -34,6 +48,7 @@ def test_series_are_tenths_of_the_run():
     steps, goals = series(row(), "goals")
     assert steps.tolist() == [*range(10, 101, 10)] and goals.tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
     assert series(row(), "return")[1][[0, 2]].tolist() == [0.0, 2.0] and np.isnan(series(row(), "td_loss")[1]).all()
+    assert [values.tolist() for values in series(row(), "score")] == [[50, 100], [9.0, 1.0]]
 
 
 def test_differences_have_welch_intervals():
@@ -71,8 +86,55 @@ def test_a_table_by_hand(tmp_path):
         "| b | 2 | 3.00 ± 0.00 | 20.0 ± 0.00 | 1.00 [-3.76, 5.76] |",
     ]
     assert table(rows[:4], ["score"], None, each=True).splitlines()[2] == "| a | 2 | 1.00, 3.00 |"
-    draw(rows, "goals", tmp_path / "goals.png")
+    draw(rows, "goals", tmp_path / "goals.png", ["a", "a without EqR"])
     assert (tmp_path / "goals.png").stat().st_size > 1_000
+
+
+def test_a_comparison_by_hand(monkeypatch):
+    """
+    One game: means 4 and 1, variances 4 and 1, so that the pooled standard deviation is √2.5, and Welch's interval as above.
+    Two games, whose scores become 0 at 0 and 1 at 2 and 20: the means of (1, 2, 3) and (1, 2, 3), and of (0, 0.5, 1) twice.
+    """
+    scores = {
+        ("with", "Pong"): (2.0, 4.0, 6.0),
+        ("without", "Pong"): (0.0, 1.0, 2.0),
+        ("with", "Boxing"): (20.0, 40.0, 60.0),
+        ("without", "Boxing"): (0.0, 10.0, 20.0),
+    }
+    rows = [row(agent, game, seed, s) for (agent, game), each in scores.items() for seed, s in enumerate(each)]
+    for i, found in enumerate(rows):
+        found["evaluations"][0]["scores"] = [float(i)]  # after 50 steps
+    bounds = SimpleNamespace(normalisation=SimpleNamespace(scores={"Pong": (0.0, 2.0), "Boxing": (0.0, 20.0)}))
+    monkeypatch.setattr("experiments.tables.read", lambda file: (bounds, rows))
+    one = compare(pathlib.Path(), "Pong", ["file"], ["Pong"], ("with", "without"), "score", "page.md")
+    half = t.ppf(0.975, (25 / 9) / (16 / 18 + 1 / 18)) * (5 / 3) ** 0.5
+    assert one.means == (4.0, 1.0) and one.difference == 3.0 and one.ends == pytest.approx((3 - half, 3 + half))
+    assert one.spread == pytest.approx(2.5**0.5) and (one.steps, one.seeds) == (100, 3)
+    both = compare(pathlib.Path(), "both", ["file"], ["Pong", "Boxing"], ("with", "without"), "score", "page.md")
+    assert both.means == (2.0, 0.5)
+    assert compare(pathlib.Path(), "Pong", ["file"], ["Pong"], ("with", "without"), "until50", "page.md").steps == 50
+
+
+def test_verdicts_follow_from_the_intervals(tmp_path):
+    ends = {"better with EqR": (0.5, 5.5), "no clear difference": (-1.0, 7.0), "worse with EqR": (-0.19, -0.01)}
+    means = [(4.0, 1.0), (4.0, 1.0), (0.285, 0.385)]
+    found = [Compared("Pong", 1_000, m, e, 1.5, 5, "page.md") for m, e in zip(means, ends.values(), strict=True)]
+    assert [one.verdict for one in found] == list(ends)
+    assert differences(found).splitlines()[2:] == [
+        "|[Pong](page.md)|1,000|5|4.0|1.0|3.0 [0.5, 5.5]|better with EqR|",
+        "|[Pong](page.md)|1,000|5|4.0|1.0|3.0 [−1.0, 7.0]|no clear difference|",
+        "|[Pong](page.md)|1,000|5|0.29|0.39|−0.10 [−0.19, −0.01]|worse with EqR|",
+    ]
+    forest(found, tmp_path / "differences.png")
+    assert (tmp_path / "differences.png").stat().st_size > 1_000
+
+
+def test_the_page_of_results_shows_the_kept_runs():
+    """Every row of the table of docs/results/index.md, from five seeds or more; each task once."""
+    found = [compare(ROOT / "docs" / "results", *arguments) for arguments in COMPARED]
+    page = (ROOT / "docs" / "results" / "index.md").read_text(encoding="utf-8")
+    assert all(line in page for line in differences(found).splitlines())
+    assert page.count("\n|[") == len(found) == len({one.task for one in found}) and min(one.seeds for one in found) >= 5
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "docs" / "results").rglob("*.jsonl.xz")), ids=lambda path: path.name)
