@@ -55,7 +55,7 @@ def train(name: str, steps: int, seed: int, out: str) -> list[int]:
     model = EqRQRDQN("CnnPolicy", env, seed=seed, **settings)
     model.learn(steps, progress_bar=name == "with EqR")
     model.save(f"{out}/{name}")
-    (monitor,) = (wrapper for wrapper in [env.envs[0]] if isinstance(wrapper, Monitor))  # type: ignore[attr-defined]
+    monitor: Monitor = env.envs[0]  # type: ignore[attr-defined]
     ends = np.cumsum(monitor.get_episode_lengths())
     return [int(end) for end, score in zip(ends, monitor.get_episode_rewards(), strict=True) if score > 0]
 
@@ -77,20 +77,23 @@ def walk(model: EqRQRDQN, n_steps: int, seed: int, deterministic: bool) -> Walk:
 
 def ball_as_predicted(model: EqRQRDQN, film: Walk) -> np.ndarray:
     """
-    Where the latent model predicted the ball ``DEPTH`` steps before, read out of its latent states by a linear function that
-    is fitted to other observations: (T, 2), in fractions of the loop; NaN in the first steps of an episode.
+    Where the latent model predicted the ball ``DEPTH`` steps before, read out of the predicted latent states by a linear
+    function that is fitted to other episodes: (T, 2), in fractions of the loop; NaN in the first steps of an episode.
     """
     known = walk(model, N_FITTED, seed=1, deterministic=False)
-    states = encode(model, th.as_tensor(known.observations)).double().numpy()
-    angles = 2 * np.pi * known.positions
-    read_out = np.linalg.lstsq(_with_one(states), np.concatenate([np.cos(angles), np.sin(angles)], axis=1), rcond=1e-4)[0]
-    ahead = predictions(model, encode(model, th.as_tensor(film.observations)), film.actions, film.starts, DEPTH)
-    cosine, sine = np.split(_with_one(ahead.double().numpy()) @ read_out, 2, axis=1)
+    predicted, shown = (_ahead(model, one) for one in (known, film))  # (T, D + 1)
+    angles, is_known = 2 * np.pi * known.positions, np.isfinite(predicted).all(axis=1)
+    wanted = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+    read_out = np.linalg.lstsq(predicted[is_known], wanted[is_known], rcond=1e-4)[0]
+    cosine, sine = np.split(shown @ read_out, 2, axis=1)
     return np.mod(np.arctan2(sine, cosine) / (2 * np.pi), 1)
 
 
-def _with_one(states: np.ndarray) -> np.ndarray:
-    return np.concatenate([states, np.ones((len(states), 1))], axis=1)
+def _ahead(model: EqRQRDQN, seen: Walk) -> np.ndarray:
+    """The latent states that were predicted ``DEPTH`` steps before, and a column of ones, (T, D + 1)."""
+    states = encode(model, th.as_tensor(seen.observations))
+    ahead = predictions(model, states, seen.actions, seen.starts, DEPTH).double().numpy()
+    return np.pad(ahead, ((0, 0), (0, 1)), constant_values=1)
 
 
 def draw(
@@ -101,16 +104,13 @@ def draw(
     with styled(), plt.rc_context({"font.size": 12}):
         figure, (world, curves) = plt.subplots(1, 2, figsize=(9, 4), dpi=100, layout="constrained", width_ratios=(4, 5))
         x = np.arange(steps + 1)
-        kept = [row for row in read(ROWS)[1]] if ROWS.is_file() else []
+        kept = read(ROWS)[1] if ROWS.is_file() else []
         for name, look in looks(list(AGENTS)).items():
             curve = np.searchsorted(goals[name], x, side="right")
             curves.plot(x, curve, color=look.color, linestyle=look.line, linewidth=2, label=f"{name}: {curve[-1]} goals")
-            ends = [
-                np.array([step for step, score in row["training"] if score > 0])
-                for row in kept
-                if row["agent"] == OF_ROWS[name]
-            ]
-            if ends:
+            runs = [row["training"] for row in kept if row["agent"] == OF_ROWS[name]]
+            if runs:
+                ends = [np.array(run["step"])[np.array(run["score"]) > 0] for run in runs]
                 others = np.stack([np.searchsorted(one, x, side="right") for one in ends])
                 curves.fill_between(x, others.min(axis=0), others.max(axis=0), color=look.color, alpha=0.15, linewidth=0)
         curves.set(xlabel="environment steps", ylabel="goals reached so far", xlim=(0, steps), ylim=(0, None))
