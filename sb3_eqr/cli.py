@@ -44,7 +44,8 @@ def main() -> None:
         print(USAGE)
     elif command not in EXTRAS:
         legal = f"one of {', '.join(EXTRAS)}, got {command!r}.{nearest(command, EXTRAS)}"
-        sys.exit(f"sb3-eqr: The command must be {legal} sb3-eqr --help lists them.")
+        print(f"sb3-eqr: The command must be {legal} sb3-eqr --help lists them.", file=sys.stderr)
+        sys.exit(2)
     else:
         run(command, EXTRAS[command])
 

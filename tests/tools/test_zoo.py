@@ -464,13 +464,11 @@ def test_the_command_without_rl_zoo(monkeypatch):
         cli.main()
 
 
-def test_the_help_lists_every_command(sb3_eqr, monkeypatch):
+def test_the_help_lists_every_command(sb3_eqr):
     """With what it does; an unknown command or option gets the closest one."""
     lines = [line for line in sb3_eqr("--help").out.splitlines() if line.startswith("  ")]
     assert [line.split()[0] for line in lines[:-2]] == [*COMMANDS, "benchmark", "visualize"]
-    monkeypatch.setattr(sys, "argv", ["sb3-eqr", "tran"])
-    with pytest.raises(SystemExit, match=r"must be one of train, enjoy.*got 'tran'\. Did you mean 'train'\?"):
-        cli.main()
+    assert "got 'tran'. Did you mean 'train'?" in sb3_eqr("tran", code=2).err
     assert "--agets a. Did you mean '--agents'?" in sb3_eqr("benchmark run x --agets a", code=2).err
 
 
