@@ -51,7 +51,9 @@ VERDICTS = {  # colour and marker of each
 MINATAR = ["Breakout", "SpaceInvaders", "Asterix", "Freeway", "Seaquest"]
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
+FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
 COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [  # the arguments of ``compare``
+    ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Large torus", ["worlds.jsonl.xz"], ["large_torus"], DEFAULTS, "goals", "worlds.md#a-large-torus"),
