@@ -61,7 +61,6 @@ COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [ 
     ("Atari Boxing", ATARI, ["Boxing"], DEFAULTS_OFF, "56000-76000", "atari100k.md"),
     ("Atari Breakout", ATARI, ["Breakout"], DEFAULTS_OFF, "40000-60000", "atari100k.md"),
     ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
-    ("LunarLander", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:off"), "score", "zoo.md"),
     ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
     *(
         (
@@ -73,7 +72,7 @@ COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [ 
             "minatar.md",
         )
         for agent, off in (("EqR_Rainbow", "rainbow"), ("EqR_QRDQN", "qrdqn"))
-        for name, games in [*((game, [game]) for game in MINATAR), ("MinAtar, mean", MINATAR)]
+        for name, games in ((game, [game]) for game in MINATAR)
     ),
 ]
 
