@@ -193,15 +193,19 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: i
     kept = [game for game in suite.games if game.lower() in map(str.lower, wanted)]
     per_game = suite.steps if steps is None else dict.fromkeys(kept, steps)
     for game in kept:
-        env_id = suite.protocol(game)["env_id"]
-        if env_id not in gym.registry:
-            raise ValueError(
-                f"suite {suite.name!r}: {env_id!r} is not registered with gymnasium."
-                f"{nearest(env_id, gym.registry, SIMILAR)} Environments of another package need --gym-packages PACKAGE, Atari "
-                'pip install ".[atari]" in a clone of the repository.'
-            )
+        check_registered(suite.name, suite.protocol(game)["env_id"])
     evaluation = suite.evaluation if episodes is None else suite.evaluation.model_copy(update={"episodes": episodes})
     return suite.model_copy(update={"games": kept, "steps": per_game, "evaluation": evaluation})
+
+
+def check_registered(suite: str, env_id: str) -> None:
+    """Raise ValueError if an environment of a suite is unknown to gymnasium."""
+    if env_id not in gym.registry:
+        raise ValueError(
+            f"suite {suite!r}: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, SIMILAR)} "
+            "Environments of another package need --gym-packages PACKAGE, also to resume, and a file of yours its folder in "
+            'PYTHONPATH; Atari needs pip install ".[atari]" in a clone of the repository.'
+        )
 
 
 def merge(old: Suite, new: Suite) -> Suite:

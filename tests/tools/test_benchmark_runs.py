@@ -27,6 +27,7 @@ from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.env_state import capture, restore
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
+from tests.toys import ChainEnv
 
 STEPS = 160
 OFTEN = Settings(checkpoint_seconds=0.0)
@@ -471,3 +472,15 @@ def test_models_of_runs_without_wrappers_are_saved_without_them(tmp_path):
     env = create_test_env("CartPole-v1", 1, stats, 0, hyperparams=hyperparams, vec_env_cls=DummyVecEnv, should_render=False)
     assert env.observation_space.shape == (4,) and not isinstance(env, VecFrameStack)
     env.close()
+
+
+def test_resuming_needs_the_package_that_registers_the_environment(tmp_path, sb3_eqr, register):
+    """Said before a run starts, as when the benchmark was planned."""
+    evaluation = {"episodes": 1, "n_envs": 1, "epsilon": 0.0, "curve": {"points": 1, "episodes": 1}}
+    own = {"mine": {"games": ["Mine"], "env_id": register("Mine-v0", ChainEnv), "steps": 60, "evaluation": evaluation}}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump(own))
+    suite = load_suite("mine", tmp_path / "own.yml")
+    runs.write_plan(tmp_path / "b", suite, runs.plan_runs(tmp_path / "b", suite, ["eqr_qrdqn"], [0], ""))
+    del gym.registry["Mine-v0"]
+    shown = sb3_eqr(f"benchmark run {tmp_path / 'b'}", code=2)
+    assert "'Mine-v0' is not registered with gymnasium" in shown.err and "--gym-packages PACKAGE, also to resume" in shown.err
