@@ -30,8 +30,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 ENV_ID = "SlidingBallDistractors-v0"
-WITHOUT: dict[str, Any] = {"prediction_depth": 0, "policy_kwargs": {"group": None}}
-AGENTS = {"with EqR": {}, "without EqR": WITHOUT}
+AGENTS: dict[str, dict[str, Any]] = {
+    "with EqR": {},
+    "without EqR": {"prediction_depth": 0, "policy_kwargs": {"group": None}},
+}
 ROWS = pathlib.Path(__file__).parents[1] / "docs" / "results" / "first_page.jsonl.xz"
 OF_ROWS = {"with EqR": "eqr_qrdqn:aet_5", "without EqR": "eqr_qrdqn:plain"}
 DEPTH, N_FRAMES, N_FITTED = 3, 90, 1_500  # steps ahead, frames of the film, observations that the read-out is fitted to
@@ -118,6 +120,7 @@ def draw(
         curves.grid()
         world.set_axis_off()
         picture = world.imshow(film.observations[0, 0], cmap="gray", vmin=0, vmax=255)
+        world.set(xlim=(-0.5, size - 0.5), ylim=(size - 0.5, -0.5))
         around = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]  # the image is a torus
         ring = {"fill": False, "linewidth": 2.5}
         circles = {}
@@ -134,8 +137,6 @@ def draw(
             picture.set_data(film.observations[t, 0])
             place("goal", goal)
             place(f"predicted {DEPTH} steps before", np.nan_to_num(ghosts[t], nan=-99))
-            world.set_xlim(-0.5, size - 0.5)
-            world.set_ylim(size - 0.5, -0.5)
             return []
 
         FuncAnimation(figure, frame, frames=len(film.actions)).save(path, writer=PillowWriter(fps=FPS))

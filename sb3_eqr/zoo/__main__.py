@@ -180,9 +180,7 @@ def check_trained(args: argparse.Namespace) -> None:
         ids = sorted(int(place) for place in places if place.isdigit())  # others are those of -uuid
         unfinished = list(pathlib.Path(args.folder, algo).glob(f"{name}_*/{FOLDER}"))
         if unfinished and not places:
-            run = max(
-                unfinished, key=lambda checkpoints: checkpoints.stat().st_mtime
-            ).parent  # the latest: _10 sorts before _2
+            run = max(unfinished, key=lambda checkpoints: checkpoints.stat().st_mtime).parent  # names: _10 is before _2
             found = f"{run} was interrupted: sb3-eqr train --algo {algo} --env {args.env} -f {args.folder} --resume {run}"
         elif ids:
             found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."
