@@ -23,7 +23,7 @@ from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, check, check_arguments, number
 from sb3_eqr.common.checks.finite_data import FiniteData
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
-from sb3_eqr.common.cuda_graph import CapturedGradients
+from sb3_eqr.common.cuda_graph import CapturedUpdate
 from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm, set_adam_defaults
 from sb3_eqr.common.objective import Objective, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy
@@ -31,6 +31,7 @@ from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, Seque
 from sb3_eqr.common.resets import Resets, ResetSchedule
 from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
 from sb3_eqr.common.saving.transfer import load_representation, representation
+from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
@@ -147,8 +148,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param intensity_scale: random intensity of images; 0 disables it
         :param resets: periodic resets, and annealing of n and γ: a :class:`~sb3_eqr.common.resets.ResetSchedule`, or
             its fields as a dictionary; ``None``: neither
-        :param cuda_graph: on a GPU, capture losses and gradients of an update as one CUDA graph: a fifth of the time, with the
-            same results up to rounding (:mod:`sb3_eqr.common.cuda_graph`); warns if it runs eagerly instead
+        :param cuda_graph: on a GPU, capture an update as one CUDA graph, with the same results up to rounding
+            (:mod:`sb3_eqr.common.cuda_graph`, docs/gpu.md); warns if it runs eagerly instead
         :param stats_window_size: Window size for the rollout logging
         :param tensorboard_log: the log location for tensorboard (if None, no logging)
         :param policy_kwargs: additional arguments to be passed to the policy on creation, see
@@ -244,7 +245,8 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             validation.warn_of_slow_bfloat16(self.device)
         self._objective_options = self._options_of_objective()
         self.objective = Objective(self.policy, **self._objective_options)
-        self._captured = CapturedGradients(self.objective, self._trained) if self.cuda_graph else None
+        graph = (self._update, self.policy.optimizer, self._settings_of_update)
+        self._captured = CapturedUpdate(*graph) if self.cuda_graph else None
 
     def _options_of_objective(self) -> dict[str, Any]:
         names = ("double_q", "shift_pixels", "intensity_scale", "aux_gradient_share")
@@ -364,7 +366,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         :param gradient_steps: number of updates
         :param batch_size: B
         """
-        buffer, policy, optimizer = self.replay_buffer, self.policy, self.policy.optimizer
+        buffer, update = self.replay_buffer, self._captured or self._update
         assert buffer is not None
         self._start_round(buffer)
         for _ in range(gradient_steps):
@@ -375,21 +377,32 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             if not buffer.can_sample():
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
-            if self._captured is not None:
-                terms = self._captured(samples, self.loss_coefs)  # the two lines below, as one CUDA graph
-            else:
-                terms = self.objective(samples, self.loss_coefs)
-                assign_gradients(terms.loss, self._trained)
-            grad_norm = self._clip_gradients()
-            optimizer.step()
+            priorities, metrics = update(samples)
             self._n_updates += 1
-            policy.after_gradient_step()
-            if self.target_update_interval is None:
-                policy.update_target(self.tau)
-            if terms.priorities is not None:
-                buffer.update_priorities(samples.indices, terms.priorities)
-            self._monitor.add({**terms.metrics(), "grad_norm": grad_norm})
+            if priorities is not None:
+                buffer.update_priorities(samples.indices, priorities)
+            self._monitor.add(metrics)
         self._log_counts(buffer)
+
+    def _update(self, samples: SequenceReplayBufferSamples) -> tuple[th.Tensor | None, dict[str, th.Tensor]]:
+        """
+        One update of parameters and targets. It reads nothing back from the device, so that it can be captured as a graph.
+
+        :param samples: B windows
+        :return: new priorities of the samples, (B,), if the TD loss is used; metrics by name, () each
+        """
+        terms = self.objective(samples, self.loss_coefs)
+        assign_gradients(terms.loss, self._trained)
+        grad_norm = self._clip_gradients()
+        self.policy.optimizer.step()
+        self.policy.after_gradient_step()
+        if self.target_update_interval is None:
+            self.policy.update_target(self.tau)
+        return terms.priorities, {**terms.metrics(), "grad_norm": grad_norm}
+
+    def _settings_of_update(self) -> tuple[Any, ...]:
+        """All numbers that ``_update`` reads, except for the learning rate."""
+        return *self.loss_coefs.values(), self.max_grad_norm, self.tau, self.target_update_interval
 
     def _clip_gradients(self) -> th.Tensor:
         """
