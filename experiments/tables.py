@@ -339,14 +339,23 @@ def differences(found: list[Compared]) -> str:
 
 
 def published() -> str:
-    """:return: Markdown: the last rows of the EqR paper's tables, computed from the scores of games in them"""
+    """:return: Markdown: the last rows of the EqR paper's tables, computed from their scores of games, each agent once"""
     scores = load_reference().pivot(index="game", columns="method", values="mean")
-    rows = []
+    tables: dict[tuple[str, str, str], list[str]] = {}  # mean, median and superhuman games -> tables
+    names: dict[tuple[str, str, str], str] = {}
     for method in sorted((name for name in scores if "[EqR Tab" in name), key=lambda name: (name[-2], name)):
         found = normalised(scores[method], (scores[RANDOM], scores[HUMAN])).dropna()
-        name, number = method.partition(" [")[0].replace("$", ""), (found > 1).sum()
-        rows.append([method[-2], name, f"{found.mean():.3f}", f"{found.median():.3f}", str(number)])
-    return markdown(["table", "method", "mean", "median", "superhuman games"], rows)
+        numbers = f"{found.mean():.3f}", f"{found.median():.3f}", str((found > 1).sum())
+        tables.setdefault(numbers, []).append(method[-2])
+        names.setdefault(numbers, in_words(method))
+    rows = [[names[numbers], ", ".join(tables[numbers]), *numbers] for numbers in sorted(tables, reverse=True)]
+    return markdown(["agent", "tables", "mean", "median", "superhuman games"], rows)
+
+
+def in_words(method: str) -> str:
+    """:return: a name in the paper's tables without LaTeX: "EqR, $L_R + L_{GET}$ [EqR Tab4]" is "EqR, reward + GET" """
+    name = method.partition(" [")[0].replace("$", "")
+    return re.sub(r"\b(GL|SE|T)_2", r"\1(2)", name.replace("L_R", "reward").replace("L_{GET}", "GET"))
 
 
 def main() -> None:

@@ -118,7 +118,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     name = entry_name(read_file(path), args.env, args.hyperparams)
     if not name.startswith("default-"):  # RL Zoo would use "default"
         return path
-    print(f"Using the entry {name!r} of {path}")
+    print(f"Using the section {name!r} of {path}")
     return write_entry(args, entry)
 
 

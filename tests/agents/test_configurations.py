@@ -37,22 +37,23 @@ EXPECTED |= dict.fromkeys(FULL, ("SE(2)^12", {"aet", "symmetry", "reward"}))
 EXPECTED |= dict.fromkeys(("rainbow", "qrdqn", "der", "drq"), (None, set()))
 
 
-def rows(text):
-    """The rows of a table in the docs: name -> arguments."""
-    found = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", text, re.M)
-    return {name: eval(f"dict({arguments})") for name, arguments in found}
-
-
 def test_the_tables_and_the_files_agree():
-    text = (ROOT / "docs" / "choosing.md").read_text().split("## Switches")[0]
-    of_paper, of_others = map(rows, text.split("Agents from other papers"))
-    for name, arguments in of_paper.items():
-        assert load_configuration("paper", **arguments) == load_configuration(name), name
-    for name, arguments in of_others.items():
-        assert arguments == load_configuration(name), name
-    files = {name for name, path in configuration_files().items() if path.parent.name == "ablations"}
-    assert of_paper.keys() | of_others.keys() | {"paper", "se2+aet+r+get"} == files == EXPECTED.keys() - {"eqr_rainbow"}
+    """One table links each agent's file, which names the same papers; the other has what differs from "paper"."""
+    text = (ROOT / "docs" / "choosing.md").read_text(encoding="utf-8")
+    agents = re.findall(r"^\| `([^`]+)` \| (.+) \| \[(.+)\]\((.+)\) \|$", text, re.M)
+    for name, description, file, target in agents:
+        path = (ROOT / "docs" / target).resolve()
+        assert path == configuration_files()[name].resolve() and file == path.name, name
+        header = path.read_text(encoding="utf-8").split("\n\n")[0]
+        assert all(paper in header for paper in re.findall(r"\((https:[^)]+)\)", description)), name
+    ablations = text.split("differ from `paper`")[-1].split("## Switches")[0]
+    rows = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|", ablations, re.M)
+    for name, arguments in rows:
+        assert load_configuration("paper", **eval(f"dict({arguments})")) == load_configuration(name), name
     assert load_configuration("se2+aet+r+get") == load_configuration("paper")
+    named = [name for name, *_ in agents] + [name for name, _ in rows] + ["se2+aet+r+get"]
+    files = {name for name, path in configuration_files().items() if path.parent.name == "ablations"}
+    assert len(named) == len(set(named)) and set(named) == files == EXPECTED.keys() - {"eqr_rainbow"}
 
 
 @pytest.mark.parametrize("kind, name", [(EqRQRDQN, None), (EqRRainbow, None), (EqRRainbow, "paper")])

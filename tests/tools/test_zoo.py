@@ -144,7 +144,7 @@ def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     register("SmallImages-v0", lambda: ImageEnv((10, 10, 3)))
     register("Dicts-v0", lambda: gym.wrappers.TimeLimit(DictEnv(), 30))
     out = sb3_eqr(f"train --algo {algo} --env {env_id} -n 90 -params learning_starts:40 --eval-freq -1 -f {tmp_path}").out
-    assert (f"Using the entry {name!r}" in out) == (name != "default")
+    assert (f"Using the section {name!r}" in out) == (name != "default")
     folder = tmp_path / algo / f"{env_id}_1"
     model = zoo.AGENTS[algo].load(folder / f"{env_id}.zip")
     assert model._n_updates > 0 and policy in (folder / env_id / "config.yml").read_text()
