@@ -23,12 +23,15 @@ TRAIN, RUN = "sb3-eqr train --algo eqr_qrdqn --env", "sb3-eqr benchmark run"
 COMMANDS = (
     f"{TRAIN} CartPole-v1 --eval-freq 5000 -n 3000 --eval-freq 1500 --eval-episodes 2",
     "sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render -n 200",
-    f"{TRAIN} FrozenLake-v1 -n 20000 -n 2000 --eval-freq -1",
     "sb3-eqr visualize with_eqr.zip --env SlidingBallDistractors-v0 --video",
     f"{RUN} results/first --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2 --steps 500",
     "sb3-eqr benchmark report results/first",
 )
-SHORTER = {"learn(8_000": "learn(900", "learn(100_000": "learn(400"}  # of Python blocks, run as one script per page
+SHORTER = {
+    "learn(8_000": "learn(900",
+    "learn(20_000": "learn(200",
+    "learn(100_000": "learn(400",
+}  # of Python blocks, run as one script per page
 
 
 def script(page: pathlib.Path) -> str:
