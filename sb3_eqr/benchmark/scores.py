@@ -23,7 +23,7 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
 
     :param folder: folder of the benchmark, or a file of ``sb3-eqr benchmark pack``
     :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
-        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps)
+        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps; NaN if not recorded)
     :raises ValueError: for a folder without finished runs
     """
     frames = []
@@ -34,7 +34,7 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
         parts = [(part["step"], part["kind"], part["scores"], part["lengths"]) for part in row["evaluations"]]
         for step, kind, scores, lengths in [*parts, (training["step"], "training", training["score"], training["length"])]:
             run = {"agent": row["agent"], "game": row["game"], "seed": row["seed"]}
-            part = {"step": step, "kind": kind, "episode": range(len(scores)), "score": scores, "length": lengths}
+            part = {"step": step, "kind": kind, "episode": range(len(scores)), "score": scores, "length": lengths or np.nan}
             frames.append(pd.DataFrame(run | part))
     if not frames:
         raise ValueError(f"{folder} must be the folder of a benchmark, got one without finished runs.")

@@ -22,6 +22,7 @@ from experiments.tables import (
     table,
 )
 from sb3_eqr.benchmark.packed import read
+from sb3_eqr.benchmark.scores import load_scores
 from tests.tools.test_package import ROOT
 
 
@@ -146,3 +147,7 @@ def test_kept_runs_can_be_read(file):
     needed = {"protocol", "entry", "versions", "machine", "started", "evaluations", "training", "losses", "wall_clock_s"}
     assert all(needed <= found.keys() for found in rows)
     assert "/root/" not in json.dumps(rows)
+    finished = [found for found in rows if "stopped_at" not in found]
+    if finished:  # older rows have no lengths of evaluated episodes
+        n_episodes = sum(len(part["scores"]) for found in finished for part in found["evaluations"])
+        assert len(load_scores(file)) == n_episodes + sum(len(found["training"]["score"]) for found in finished)
