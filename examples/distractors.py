@@ -5,7 +5,7 @@ The README's picture: a task where EqR helps, learned with EqR and without it, b
 
 Writes both models and demo.gif to --out. In the picture's left half the trained agent moves the white ball to the goal; the
 orange ring is where its latent model predicted, three steps before, that the ball would be. The right half shows the goals
-that both agents reached while they learned, over the range of ten other seeds (docs/results/first_page.jsonl.xz).
+that both agents reached while they learned, over the range of ten seeds (docs/results/first_page.jsonl.xz).
 """
 
 import argparse
@@ -38,6 +38,7 @@ ROWS = pathlib.Path(__file__).parents[1] / "docs" / "results" / "first_page.json
 OF_ROWS = {"with EqR": "eqr_qrdqn:aet_5", "without EqR": "eqr_qrdqn:plain"}
 DEPTH, N_FRAMES, N_FITTED = 3, 90, 1_500  # steps ahead, frames of the film, observations that the read-out is fitted to
 FPS = 5
+SEED = 24  # of the ten seeds kept, the one whose difference is nearest to their mean
 
 
 class Walk(NamedTuple):
@@ -113,8 +114,10 @@ def draw(
             runs = [row["training"] for row in kept if row["agent"] == OF_ROWS[name]]
             if runs:
                 ends = [np.array(run["step"])[np.array(run["score"]) > 0] for run in runs]
-                others = np.stack([np.searchsorted(one, x, side="right") for one in ends])
-                curves.fill_between(x, others.min(axis=0), others.max(axis=0), color=look.color, alpha=0.15, linewidth=0)
+                kept_curves = np.stack([np.searchsorted(one, x, side="right") for one in ends])
+                curves.fill_between(
+                    x, kept_curves.min(axis=0), kept_curves.max(axis=0), color=look.color, alpha=0.15, linewidth=0
+                )
         curves.set(xlabel="environment steps", ylabel="goals reached so far", xlim=(0, steps), ylim=(0, None))
         curves.legend(loc="upper left")
         curves.grid()
@@ -149,7 +152,7 @@ def main() -> None:
         description=__doc__.strip().split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     parser.add_argument("--steps", type=int, default=8_000, help="environment steps")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all random generators")
+    parser.add_argument("--seed", type=int, default=SEED, help="seed of all random generators")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("demo_results/distractors"), help="output folder")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

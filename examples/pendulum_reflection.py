@@ -1,7 +1,7 @@
 """
 Example 1 of the paper: does ρ negate the torque of a pendulum without gravity when the environment is mirrored?
 
-    python examples/pendulum_reflection.py --seeds 0 1      # the table of docs/latent_states.md, some minutes per group
+    python examples/pendulum_reflection.py --seeds 0 1      # a table of docs/results/representation.md, some minutes per group
 
 For pairs of a state and its mirror image, ρ(τ_g) κ(s, a) is compared with κ at the mirrored state for the same torque and for
 the opposite one: the distance between the states to which they move the mirrored state, relative to that between the two

@@ -1,7 +1,7 @@
 """
 Does a representation help with another task? A ball on a torus with two goals: the dynamics are the same, the rewards differ.
 
-    python examples/transfer.py --seeds 0 1 2 3 4      # the table of docs/latent_states.md, an hour on one thread
+    python examples/transfer.py --seeds 0 1 2 3 4      # a table of docs/results/representation.md, an hour on one thread
 
 For each seed, an agent learns goal A; agents for goal B start from scratch, from A's representation (also frozen), and from
 one that was learned without a goal. Writes models, evaluations and results.jsonl to --out; finished runs are not repeated.
