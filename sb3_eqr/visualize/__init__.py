@@ -1,6 +1,6 @@
 """
 Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metrics and figures (docs/latent_states.md),
-``diagnose`` computes the metrics, ``LatentCallback`` logs them during training, ``record`` writes an animation. Needs
+``diagnose`` computes the metrics, ``LatentCallback`` logs them during training, ``record`` writes a video. Needs
 ``pip install ".[visualize]"`` in a clone of the repository.
 
 ``__main__`` parses the command line, ``loading`` loads model and environment, ``trust`` checks files from others. ``latents``

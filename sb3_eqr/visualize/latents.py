@@ -1,4 +1,4 @@
-"""The latent states of an agent on windows of steps: the input of all metrics, figures and animations."""
+"""The latent states of an agent on windows of steps: the input of all metrics, figures and videos."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
