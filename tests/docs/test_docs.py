@@ -41,6 +41,7 @@ import sb3_eqr.zoo.hub
 from sb3_eqr import ExactCheckpointCallback, cli
 from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.benchmark.suites import choose, load_suite, make_suite
+from sb3_eqr.zoo import register
 from sb3_eqr.zoo.entries import check_entry
 from tests.tools.test_report import a_benchmark
 
@@ -69,6 +70,7 @@ def check_sh(example):
 
 def check_yaml(example):
     """Hyperparameters have the key ``policy``, suites the key ``games``."""
+    register()  # RL Zoo knows our agents only then
     for name, entry in yaml.safe_load(example.parsed).items():
         if "games" in entry:
             make_suite(name, "docs", entry)
