@@ -21,6 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_eqr import EqRQRDQN
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.envs import SlidingBall
+from sb3_eqr.plot_style import COLORS, styled
 from sb3_eqr.representation import train_representation
 from sb3_eqr.visualize.latents import action_elements, coordinates, encode, split
 
@@ -137,36 +138,36 @@ def measure(model: EqRQRDQN, world: SlidingBall, per_axis: int) -> dict[str, Any
     }
 
 
-def draw(model: EqRQRDQN, world: SlidingBall, title: str, path: pathlib.Path) -> None:
-    """Figure 3: the image of the vector (1, 0) under each block; the eight red points are equal steps along an axis."""
+def draw(model: EqRQRDQN, world: SlidingBall, path: pathlib.Path) -> None:
+    """Figure 3: the image of the vector (1, 0) under each block; the eight numbered points are equal steps along an axis."""
     n_blocks, axes = model.policy.latent_model.n_blocks, world.dimensions
-    figure, panels = plt.subplots(
-        axes, n_blocks + 1, figsize=(3 * (n_blocks + 1), 3.2 * axes), squeeze=False, layout="constrained"
-    )
-    figure.suptitle(title, fontsize="medium")
-    for axis in range(axes):
-        along = np.full((GRID["ball"], axes), 0.5)
-        along[:, axis] = np.arange(GRID["ball"]) / GRID["ball"]
-        every = along[:: GRID["ball"] // 8]  # eight positions
-        angles = 2 * np.pi * turns(model, encode(model, images(world, along)))
-        eight = 2 * np.pi * turns(model, encode(model, images(world, every)))
-        shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
-        panels[axis, 0].imshow(np.block([list(shown[:4]), list(shown[4:])]), cmap="gray")
-        panels[axis, 0].set_title("positions 0 to 3, 4 to 7", fontsize="small")
-        panels[axis, 0].set_axis_off()
-        for k in range(n_blocks):
-            panel = panels[axis, k + 1]
-            panel.plot(np.cos(angles[:, k]), -np.sin(angles[:, k]), ".", color="0.7", markersize=3)
-            panel.plot(np.cos(eight[:, k]), -np.sin(eight[:, k]), "o", color="C3", markersize=6)
-            for number, angle in enumerate(eight[:, k]):
-                panel.annotate(
-                    str(number), (1.18 * np.cos(angle), -1.18 * np.sin(angle)), ha="center", va="center", fontsize=7
-                )
-            panel.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4), aspect="equal")
-            panel.set_title(f"block {k}" + (f", {AXES[axis]} motion" if axes > 1 else ""), fontsize="small")
-    with atomic_write(path, "png") as file:
-        figure.savefig(file, dpi=110)
-    plt.close(figure)
+    with styled():
+        figure, panels = plt.subplots(
+            axes, n_blocks + 1, figsize=(2 * n_blocks + 2, 2.2 * axes), squeeze=False, layout="constrained"
+        )
+        for axis in range(axes):
+            along = np.full((GRID["ball"], axes), 0.5)
+            along[:, axis] = np.arange(GRID["ball"]) / GRID["ball"]
+            every = along[:: GRID["ball"] // 8]  # eight positions
+            angles = 2 * np.pi * turns(model, encode(model, images(world, along)))
+            eight = 2 * np.pi * turns(model, encode(model, images(world, every)))
+            shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
+            panels[axis, 0].imshow(np.block([list(shown[:4]), list(shown[4:])]), cmap="gray")
+            panels[axis, 0].set_title(f"{AXES[axis]} motion,\npositions 0 to 3, 4 to 7")
+            panels[axis, 0].set_axis_off()
+            for k in range(n_blocks):
+                panel = panels[axis, k + 1]
+                panel.plot(np.cos(angles[:, k]), -np.sin(angles[:, k]), ".", color="#b0b0b0", markersize=3)
+                panel.plot(np.cos(eight[:, k]), -np.sin(eight[:, k]), "o", color=COLORS[1], markersize=5)
+                is_wide = np.ptp(np.cos(eight[:, k])) > 1  # otherwise the numbers would overlap
+                for number, angle in enumerate(eight[:, k] if is_wide else []):
+                    place = (1.22 * np.cos(angle), -1.22 * np.sin(angle))
+                    panel.annotate(str(number), place, ha="center", va="center", fontsize=8)
+                panel.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5), aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+                panel.set_title(f"block {k}: {'turns' if is_wide else 'rests'}")
+        with atomic_write(path, "png") as file:
+            figure.savefig(file, dpi=200)
+        plt.close(figure)
 
 
 def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> dict[str, Any]:
@@ -186,7 +187,7 @@ def run(world_name: str, arm: str, seed: int, steps: int, out: pathlib.Path) -> 
     name = f"{world_name}-{arm}-{seed}".replace(", ", "-").replace(" ", "_")
     model.save(out / name)
     result = {"world": world_name, "arm": arm, "seed": seed, "steps": steps, **measure(model, world, GRID[world_name])}
-    draw(model, world, f"{world_name}, {arm}, seed {seed}", out / f"{name}.png")
+    draw(model, world, out / f"{name}.png")
     return result
 
 

@@ -48,7 +48,8 @@ VERDICTS = {  # colour and marker of each
     "no clear difference": (GREY, "o"),
     "worse with EqR": (COLORS[1], "v"),
 }
-MINATAR = ["Breakout", "SpaceInvaders", "Asterix", "Freeway", "Seaquest"]
+MINATAR, MINATAR_RUNS = ["Breakout", "SpaceInvaders", "Asterix", "Freeway", "Seaquest"], ["minatar_30k_final.jsonl.xz"]
+OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
@@ -63,17 +64,14 @@ COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [ 
     ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
     ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
     *(
-        (
-            f"{name}, {agent}",
-            ["minatar_30k_final.jsonl.xz"],
-            games,
-            (agent.lower(), f"{agent.lower()}:{off}"),
-            "score",
-            "minatar.md",
-        )
-        for agent, off in (("EqR_Rainbow", "rainbow"), ("EqR_QRDQN", "qrdqn"))
-        for name, games in ((game, [game]) for game in MINATAR)
+        (f"{game}, {agent}", MINATAR_RUNS, [game], (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
+        for agent, off in OFF.items()
+        for game in MINATAR
     ),
+]
+MEANS: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [
+    (f"MinAtar, {agent}", MINATAR_RUNS, MINATAR, (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
+    for agent, off in OFF.items()
 ]
 
 
@@ -241,7 +239,7 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
                         width = student.ppf(0.975, len(runs) - 1) * runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
                     axis.plot(steps, mean, look.marker, ls=look.line, color=look.color, label=names[agent])
                     axis.fill_between(steps, mean - width, mean + width, color=look.color, alpha=0.15, lw=0)
-            axis.set(title=TITLES.get(game, game), xlim=(0, None))
+            axis.set(title=TITLES.get(game, game), xlim=(0, None), ylim=(min(0, axis.get_ylim()[0]), None))
             axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             axis.grid(axis="y")
         for axis in axes.flat[len(games) :]:
@@ -384,7 +382,8 @@ def main() -> None:
         compared = [compare(args.files[0], *arguments) for arguments in COMPARED]
         compared.sort(key=lambda one: -one.difference / one.spread)
         forest(compared, args.differences)
-        print(differences(compared))
+        means = [compare(args.files[0], *arguments) for arguments in MEANS]
+        print(f"{differences(compared)}\n\nMeans of normalised scores:\n\n{differences(means)}")
         return
     rows = [row for file in args.files for row in read(file)[1]]
     full = {name: agent for agent in unique(rows, "agent") for name in (agent, agent.partition(":")[2])}

@@ -5,7 +5,7 @@ Visualise what an agent has learned: ``sb3-eqr visualize MODEL.zip`` writes metr
 
 ``__main__`` parses the command line, ``loading`` loads model and environment, ``trust`` checks files from others. ``latents``
 runs the agent and encodes, ``measures`` and ``findings`` compute, ``diagnostics`` collects the metrics and the verdict;
-``tables`` and ``pictures`` write them, ``film`` animates the states. ``callback`` is for use during training.
+``tables`` and ``pictures`` write them, ``film`` makes videos. ``callback`` is for use during training.
 """
 
 import importlib

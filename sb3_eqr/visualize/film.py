@@ -1,4 +1,4 @@
-"""A film of the environment beside the blocks of the latent state: now, and as predicted some steps before."""
+"""Videos of the environment beside the blocks of the latent state: now, and as predicted some steps before."""
 
 import pathlib
 from collections.abc import Iterator, Sequence
