@@ -2,8 +2,8 @@
 The gate of an agent for continuous actions: does a latent model make SB3's SAC learn faster? The plan, which is older than the
 first run, is experiments/settings/continuous/README.md.
 
-    python experiments/continuous.py train runs/gate --tasks HalfCheetah-v5 --arms sac se2 --seeds 0
-    python experiments/continuous.py report docs/results/continuous_gate.xz
+    python -m experiments.continuous train runs/gate --tasks HalfCheetah-v5 --arms sac se2 --seeds 0
+    python -m experiments.continuous report docs/results/continuous_gate.xz
 """
 
 import argparse
@@ -26,6 +26,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from experiments.tables import draw
 from sb3_eqr import SequenceReplayBuffer
 from sb3_eqr.common.groups import NoGroup
 from sb3_eqr.common.groups.layer import GroupLayer
@@ -258,6 +259,16 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]]) -> str:
     return "\n".join(lines)
 
 
+def rows(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], arms: Sequence[str]) -> list[dict[str, Any]]:
+    """The runs of these arms as rows of a benchmark, for ``experiments.tables``."""
+    found = [
+        run for (_, arm), of_key in sorted(runs.items(), key=lambda item: TASKS.index(item[0][0])) for run in of_key.values()
+    ]
+    named = {"agent": "arm", "game": "task", "seed": "seed", "training": "training"}
+    kept = sorted((run for run in found if run["arm"] in arms), key=lambda run: arms.index(run["arm"]))
+    return [{**{key: run[name] for key, name in named.items()}, "protocol": {"steps": run["steps"]}} for run in kept]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -269,6 +280,9 @@ def main() -> None:
     running.add_argument("--steps", type=int, default=N_STEPS)
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
+    reporting.add_argument(
+        "--figure", type=pathlib.Path, help="also draw the returns of sac and none in training into this file"
+    )
     reporting.add_argument("--pack", type=pathlib.Path, help="also write all runs into this file, packed by xz")
     args = parser.parse_args()
     if args.command == "train":
@@ -276,9 +290,11 @@ def main() -> None:
         return
     runs = read(args.paths)
     if args.pack is not None:
-        rows = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
+        lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
         with atomic_write(args.pack, "xz") as out:
-            out.write(lzma.compress("".join(rows).encode()))
+            out.write(lzma.compress("".join(lines).encode()))
+    if args.figure is not None:
+        draw(rows(runs, ["none", "sac"]), "return", args.figure, ["SAC with a latent model", "SAC"])
     print(report(runs))
 
 
