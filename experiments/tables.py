@@ -35,6 +35,7 @@ from sb3_eqr.benchmark.scores import evaluation_curve, normalised
 from sb3_eqr.plot_style import COLORS, GREY, looks, styled
 
 Row = dict[str, Any]
+Arguments = tuple[str, list[str], list[str], tuple[str, str], str, str]  # of ``compare``
 PARTS = 10  # of a run, for the return at its end and for figures
 WIDTH, DPI = 3.9, 200  # of figures, in inches and dots per inch
 AXES = {
@@ -53,7 +54,7 @@ OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
-COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [  # the arguments of ``compare``
+COMPARED: list[Arguments] = [
     ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
@@ -69,7 +70,7 @@ COMPARED: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [ 
         for game in MINATAR
     ),
 ]
-MEANS: list[tuple[str, list[str], list[str], tuple[str, str], str, str]] = [
+MEANS: list[Arguments] = [  # printed, not drawn
     (f"MinAtar, {agent}", MINATAR_RUNS, MINATAR, (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
     for agent, off in OFF.items()
 ]

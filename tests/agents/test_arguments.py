@@ -76,10 +76,10 @@ def test_every_argument_has_a_rule():
 
 @EITHER
 def test_steps_may_be_a_float(make, tmp_path):
-    model = make(ChainEnv(), learning_starts=None).learn(2e2)
+    model = make(ChainEnv(), learning_starts=None).learn(5e1)
     model.save(tmp_path / "model")
     loaded = type(model).load(tmp_path / "model")
-    assert (model.learning_starts, loaded.learning_starts) == (20, 20) and isinstance(loaded.learning_starts, int)
+    assert (model.learning_starts, loaded.learning_starts) == (5, 5) and isinstance(loaded.learning_starts, int)
     model.learn(1e1, reset_num_timesteps=False)
 
 
