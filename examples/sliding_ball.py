@@ -2,7 +2,7 @@
 Example 2 and Figure 3 of the paper: the latent space of a sliding ball, learned from random actions without reward.
 
     python examples/sliding_ball.py                                  # the ball, SO(2), one seed, two minutes
-    python examples/sliding_ball.py --seeds 0 1 2 3 4 --arms each    # the table of docs/latent_states.md
+    python examples/sliding_ball.py --seeds 0 1 2 3 4 --arms each    # the table of docs/without_reward.md
     python examples/sliding_ball.py --world torus                    # a torus, two blocks
 
 Writes a model and a figure per run, and results.jsonl with a line per run, to --out. Finished runs are not repeated.

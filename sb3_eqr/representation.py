@@ -102,7 +102,7 @@ def train_representation(
     Train τ and κ with the AET loss on random actions, without Q-learning and without rewards. Returns an ordinary agent
     (``td_coef=0``), which works with ``save``, ``sb3-eqr visualize`` and ``load_representation``; its Q head is untrained.
 
-    The defaults are the minimum that recovered the sliding ball's circle and torus (docs/latent_states.md): whitened latent
+    The defaults are the minimum that recovered the sliding ball's circle and torus (docs/without_reward.md): whitened latent
     states with a parameterization without discontinuities, actions fixed to the identity at first, the contrastive loss. The
     paper's example as stated (``aet_loss="distance", parameterization="euler", whiten=False, still_timesteps=0``) collapses.
 
