@@ -6,7 +6,7 @@ import io
 import pathlib
 import warnings
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -32,8 +32,6 @@ from sb3_eqr.common.resets import Resets, ResetSchedule
 from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
 from sb3_eqr.common.saving.transfer import load_representation, representation
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
-
-SelfEqRAlgorithm = TypeVar("SelfEqRAlgorithm", bound="EqRAlgorithm")
 
 # Arguments of the replay buffer that the algorithm sets and changes.
 SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth", "buffer_size", "device")
@@ -461,14 +459,14 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
 
     def learn(
-        self: SelfEqRAlgorithm,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfEqRAlgorithm:
+    ) -> Self:
         """As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class."""
         check("total_timesteps", total_timesteps, number(0))
         log_name = tb_log_name or type(self).__name__
@@ -507,9 +505,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
                 if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
                     state[name] = th.empty_like(parameter).copy_(value)  # fused kernels need the same memory layout
 
-    def load_representation(
-        self: SelfEqRAlgorithm, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False
-    ) -> SelfEqRAlgorithm:
+    def load_representation(self, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False) -> Self:
         """
         Load encoder, κ, ρ and b of another run with the same observations and actions (paper, §4).
 

@@ -40,14 +40,6 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         """
         return self.expectation(self.head(self.features(obs), self.head.draw_noise() if noisy else None))
 
-    def log_probs(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
-        """
-        :param obs: (B, *obs_shape), or a dict of these
-        :param noisy: whether to draw noise in noisy layers
-        :return: log-probabilities of the returns in ``support``, (B, n_atoms, n_actions)
-        """
-        return self.head(self.features(obs), self.head.draw_noise() if noisy else None).log_softmax(dim=1)
-
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         support = self.support.view(-1, *[1] * (outputs.ndim - 2))  # (N, 1) or (N,)
         return (outputs.softmax(dim=1) * support).sum(dim=1)

@@ -1,6 +1,6 @@
 """The components of the diagnostics: motion, generators, disentanglement, action symmetry, collapse."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO
 from sb3_eqr.common.losses import normalized_distance
-from sb3_eqr.common.networks.encoders import GroupFeaturesExtractor, NormalizedExtractor
+from sb3_eqr.common.networks.encoders import trunk_of
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import latents, measures
 
@@ -159,9 +159,7 @@ def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchO
 
 def _trunk_outputs(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """The outputs of the trunk, (N, U)."""
-    trunk: Any = model.policy.online.features_extractor
-    while isinstance(trunk, (GroupFeaturesExtractor, NormalizedExtractor)):
-        trunk = trunk.trunk  # after a layer norm, a unit that is always 0 is not constant
+    trunk = trunk_of(model.policy.online.features_extractor)  # after a layer norm, a unit that is always 0 is not constant
     seen: list[th.Tensor] = []
     hook = trunk.register_forward_hook(lambda _module, _inputs, output: seen.append(output.flatten(1)))
     try:

@@ -64,6 +64,11 @@ def test_double_q_by_hand(double_q, goal):
     assert terminal.losses["td"].item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
 
 
+def outputs_of(network, obs):
+    """The head's outputs without noise, (B, n_atoms, n_actions)."""
+    return network.head(network.features(obs))
+
+
 def test_dueling_by_hand():
     """
     Value logits (ln 2, 0, 0); advantages (ln 2, 0, 0), 0 and 0, with the mean (ln 2 / 3, 0, 0). So the logits of atom -1
@@ -76,7 +81,7 @@ def test_dueling_by_hand():
     expected = [(1 - w) / (w + 2) for w in weights]
     found = model.q_net(th.zeros(1, 3))
     np.testing.assert_allclose(found.detach().numpy(), [expected], rtol=1e-5)
-    probabilities = model.q_net.log_probs(th.zeros(1, 3)).exp()  # (1, 3 atoms, 3 actions)
+    probabilities = outputs_of(model.q_net, th.zeros(1, 3)).softmax(dim=1)  # (1, 3 atoms, 3 actions)
     np.testing.assert_allclose(probabilities[0, :, 0].detach(), np.array([weights[0], 1, 1]) / (weights[0] + 2), rtol=1e-5)
     assert model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0] in (1, 2)
 
@@ -92,8 +97,8 @@ def test_an_untrained_head_predicts_returns_near_0(dueling, v_min, v_max, centre
     )
     obs = th.randn(5, 3)
     density = th.distributions.Cauchy(centre, 2.0).log_prob(th.linspace(v_min, v_max, 9))[None, :, None]
-    expected = (plain.log_probs(obs) + density).log_softmax(dim=1)
-    th.testing.assert_close(peaked.log_probs(obs), expected, rtol=1e-4, atol=1e-5)
+    expected = (outputs_of(plain, obs).log_softmax(dim=1) + density).log_softmax(dim=1)
+    th.testing.assert_close(outputs_of(peaked, obs).log_softmax(dim=1), expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("spread, lowest, highest", [(0.025, 50, 400), (None, 1.5, 5)])

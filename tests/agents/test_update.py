@@ -68,8 +68,9 @@ def test_categorical_td_loss_by_loops(double_q, dueling):
     samples = model.replay_buffer.sample(16)
     with th.no_grad():
         td = loss_terms(model, samples)
-        now, online = (model.q_net.log_probs(o).double().numpy() for o in (samples.observations, samples.next_observations))
-        target = model.q_net_target.log_probs(samples.next_observations).double().numpy()  # (16, 9, 3)
+        asked = [(model.q_net, samples.observations)]
+        asked += [(net, samples.next_observations) for net in (model.q_net, model.q_net_target)]
+        now, online, target = (net.head(net.features(obs)).log_softmax(dim=1).double().numpy() for net, obs in asked)
     support = [-1.0 + 3.0 * i / 8 for i in range(9)]
     q_values = [np.einsum("bna,n->ba", np.exp(logs), support) for logs in (online, target)]
     assert (q_values[0].argmax(axis=1) != q_values[1].argmax(axis=1)).any()

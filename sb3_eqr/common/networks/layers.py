@@ -1,4 +1,4 @@
-"""Layers that PyTorch lacks: noisy linear layers, the distributional head, centring, whitening."""
+"""Layers that PyTorch lacks: noisy linear layers, the distributional head, centring."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
