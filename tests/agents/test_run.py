@@ -20,7 +20,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_eqr import GroupFeaturesExtractor, SequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, GroupFeaturesExtractor, SequenceReplayBuffer
 from sb3_eqr.common.networks.encoders import ConvExtractor, NormalizedExtractor
 from tests.models import BOTH, EITHER, N_ATOMS, PAPER, PAPER_FLAT, POLICIES, SMALL, all_finite, draw, same, tensors, untrained
 from tests.toys import ChainEnv, ImageEnv, SampledEnv
@@ -411,7 +411,8 @@ def test_predict_shapes(make):
     assert model.predict(obs[0])[0].shape == ()
     assert model.policy(th.zeros(4, 3)).shape == (4,)
     online = model.policy.online
-    assert online.head(online.features(th.zeros(4, 3))).shape == (4, N_ATOMS, 3)
+    outputs = online(th.zeros(4, 3)) if make.algorithm is EqRQRDQN else online.head(online.features(th.zeros(4, 3)))
+    assert outputs.shape == (4, N_ATOMS, 3)
     with pytest.raises(ValueError, match="Gym API"):
         model.predict(ChainEnv().reset())
 
