@@ -1,7 +1,5 @@
 """The algorithm: arguments, components and training loop of all EqR agents (Algorithm 1)."""
 
-import copy
-import inspect
 import io
 import pathlib
 import warnings
@@ -12,33 +10,26 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule, get_device
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
-from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, check, check_arguments, number
-from sb3_eqr.common.checks.finite_data import FiniteData
+from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedUpdate
 from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm, set_adam_defaults
 from sb3_eqr.common.objective import Objective, keep_freed_memory
+from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
-from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
 from sb3_eqr.common.saving.transfer import load_representation, representation
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
-# Arguments of the replay buffer that the algorithm sets and changes.
-SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth", "buffer_size", "device")
 MAX_LEARNING_STARTS = 2_000  # Table 5, of 100,000 steps
 
 
-class EqRAlgorithm(FiniteData, SafeFiles):
+class EqRAlgorithm(EqROffPolicy):
     """
     Mixin, listed before an SB3 Q-learning algorithm. Each update samples windows, adds the auxiliary losses to the TD loss,
     makes one backward pass, clips the gradients, makes one optimiser step, and updates targets and priorities. The policy's
@@ -163,8 +154,7 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         """
         check_arguments(locals(), ALGORITHM)
         validation.check_device(device)
-        if optimize_memory_usage:
-            warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each frame only once.")
+        validation.warn_of_memory_option(optimize_memory_usage)
         policy_kwargs = dict(policy_kwargs or {})  # a copy, because SB3 changes it
         set_adam_defaults(policy_kwargs, get_device(device))
         super().__init__(  # type: ignore[call-arg]
@@ -290,47 +280,21 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         """The weight λ of each loss by its name."""
         return {"td": self.td_coef, "aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
 
-    @property
-    def depth(self) -> int:
-        """The effective M: 0 if all auxiliary losses are disabled."""
-        is_used = any(coef for name, coef in self.loss_coefs.items() if name != "td")
-        return self.prediction_depth if is_used else 0
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        if any(kind.__module__.split(".")[0] == "gym" for kind in type(env).__mro__):
-            env = _patch_env(env)  # environments of the old gym need shimmy, as in SB3
-        validation.check_env(env)
-        if isinstance(found := getattr(env, "observation_space", None), spaces.Space):
-            validation.check_observation_space(found)
-        with validation.environment_errors(0):
-            wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        validation.check_action_space(wrapped.action_space)
-        return wrapped
-
     def _make_policy(self) -> EqRPolicy:
         policy: Any = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         return policy.to(self.device)
 
     def _make_replay_buffer(self) -> SequenceReplayBuffer:
         default = PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
-        buffer_class = self.replay_buffer_class or default
-        legal = inspect.signature(buffer_class).parameters
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in legal.values()):
-            validation.check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
         longest = max(self.n_steps, self._resets.schedule.initial_n_steps or 0)  # the buffer must be able to hold it
-        kwargs: dict[str, Any] = {"n_steps": longest, "gamma": self.gamma, "prediction_depth": self.depth}
-        kwargs |= {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack, "n_envs": self.n_envs}
-        return buffer_class(self.buffer_size, self.observation_space, self.action_space, self.device, **kwargs)
+        return self._new_replay_buffer(self.replay_buffer_class or default, longest)
 
-    def _find_frame_stack(self) -> int:
-        stack: Any = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
-        found = 1
-        if stack is not None and is_image_space(self.observation_space):
-            # The first axis consists of frames only if VecFrameStack stacked along the channels.
-            if stack.stacked_obs.channels_first == is_image_space_channels_first(stack.venv.observation_space):
-                found = stack.stacked_obs.n_stack
-        return self.replay_buffer_kwargs.get("frame_stack", found)
+    @classmethod
+    def _check_action_space(cls, action_space: spaces.Space) -> None:
+        validation.check_action_space(action_space)
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [self.policy.optimizer]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
@@ -447,64 +411,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
             self.logger.record("train/n_resets", len(self._resets.done))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _log_last_round(self, check_model: bool = False) -> None:
-        """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
-        try:
-            for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
-                for name, value in update.items():
-                    self.logger.record_mean(f"train/{name}", value)
-            if check_model:
-                self._monitor.check_model(self._n_updates)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class."""
-        check("total_timesteps", total_timesteps, number(0))
-        log_name = tb_log_name or type(self).__name__
-        super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
-        self._log_last_round(check_model=True)
-        if log_interval is not None:  # SB3 logs only at the end of episodes, so the last updates would be missing
-            self.dump_logs()
-        return self
-
-    def dump_logs(self) -> None:
-        """Write log data; losses are means over all updates since the last call."""
-        self._log_last_round()
-        super().dump_logs()
-
-    def set_parameters(
-        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """
-        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution, or if the moments
-        of the optimiser do not fit its parameters. After an error, all parameters are as before.
-        """
-        if not isinstance(load_path_or_dict, dict):
-            content = read_model(load_path_or_dict)
-            validation.check_same_parameters(self.policy_description, data_of(content).get("policy_description", {}))
-            load_path_or_dict = io.BytesIO(content)  # type: ignore[assignment]
-        self._monitor.forget()
-        before: Any = copy.deepcopy(self.get_parameters())
-        try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
-            validation.check_moments(self.policy.optimizer)
-        except Exception:
-            super().set_parameters(before)  # PyTorch copies the tensors that fit before it raises
-            raise
-        for parameter, state in self.policy.optimizer.state.items():
-            for name, value in state.items():
-                if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
-                    state[name] = th.empty_like(parameter).copy_(value)  # fused kernels need the same memory layout
-
     def load_representation(self, path: str | pathlib.Path | io.BufferedIOBase, freeze: bool = False) -> Self:
         """
         Load encoder, κ, ρ and b of another run with the same observations and actions (paper, §4).
@@ -522,9 +428,6 @@ class EqRAlgorithm(FiniteData, SafeFiles):
         self.representation_frozen = freeze
         self.policy.freeze(list(representation(self.policy).values()) if freeze else [])
         return self
-
-    def _before_saving(self) -> None:
-        self._log_last_round(check_model=True)  # which never writes a model that is not finite
 
     def _excluded_save_params(self) -> list[str]:
         return [

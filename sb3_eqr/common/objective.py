@@ -1,18 +1,16 @@
 """The objective of one update (Eq. 21): computes the losses of samples. ``EqRAlgorithm.train`` applies them."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_eqr.common.augmentations import random_intensity, random_shift
 from sb3_eqr.common.latent.gradients import branch
-from sb3_eqr.common.networks.encoders import MlpExtractor, trunk_of
+from sb3_eqr.common.latent.latent_model import LatentModel
+from sb3_eqr.common.networks.encoders import is_flat
+from sb3_eqr.common.networks.inputs import Augmentation
 from sb3_eqr.common.policies import EqRPolicy, ignores_mode
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
@@ -41,7 +39,73 @@ class LossTerms(NamedTuple):
         return metrics
 
 
-class Objective:
+class HasLatentModel(Protocol):
+    """A policy with a latent model and its target copy."""
+
+    latent_model: LatentModel
+    latent_target: LatentModel
+
+    @property
+    def device(self) -> th.device:
+        """Where its parameters are."""
+
+    def embed_actions(self, actions: th.Tensor) -> th.Tensor:
+        """Action embeddings, (..., A), of actions."""
+
+
+class LatentObjective:
+    """
+    The auxiliary losses of windows.
+
+    :param policy: latent model and its target copy
+    :param encoder: the encoder that is trained
+    :param latent_encoder: the encoder of the latent model's targets
+    :param augment: prepares observations for the encoders
+    :param target_dtype: in which encoders compute where no gradient flows
+    """
+
+    def __init__(
+        self,
+        policy: HasLatentModel,
+        encoder: nn.Module,
+        latent_encoder: nn.Module,
+        augment: Augmentation,
+        target_dtype: th.dtype = th.float32,
+    ):
+        self.policy = policy
+        self.encoder = encoder
+        self.latent_encoder = latent_encoder
+        self.augment = augment
+        self.target_dtype = target_dtype
+
+    def latent_losses(
+        self, names: list[str], samples: SequenceReplayBufferSamples, observations: PyTorchObs, features: th.Tensor
+    ) -> dict[str, th.Tensor]:
+        """The auxiliary losses along the rollout. The target encoder sees s_t with the online encoder's augmentation."""
+        rollout, mask, rewards = samples.rollout_observations, samples.mask, samples.rollout_rewards
+        assert rollout is not None and mask is not None and rewards is not None and samples.rollout_actions is not None
+        latent_model, target_features, target_rollout = self.policy.latent_model, None, None
+        with th.no_grad():
+            if latent_model.NEED_FEATURES.intersection(names):
+                is_same = self.latent_encoder is self.encoder
+                target_features = features if is_same else self.encode(self.latent_encoder, observations)
+            if latent_model.NEED_ROLLOUT.intersection(names):
+                augmented = self.augment(flat(rollout), self.target_dtype)
+                target_rollout = self.encode(self.latent_encoder, augmented)  # (B * M, F)
+        # After the end of an episode, action 0: what follows must not leak through batch statistics.
+        embedded = self.policy.embed_actions(valid_actions(samples.rollout_actions, mask))  # (B, M, A)
+        target = self.policy.latent_target
+        return latent_model(names, features, embedded, rewards, mask, target, target_features, target_rollout)
+
+    def encode(self, encoder: nn.Module, observations: PyTorchObs) -> th.Tensor:
+        """Features without gradient, (B, F), of augmented observations, (B, *obs_shape)."""
+        if self.target_dtype == th.float32:
+            return encoder(observations)
+        with th.autocast(self.policy.device.type, self.target_dtype, cache_enabled=False):
+            return encoder(observations).float()
+
+
+class Objective(LatentObjective):
     """
     The sum of TD and auxiliary losses that an update minimises.
 
@@ -55,6 +119,8 @@ class Objective:
         online one, unless that computes something else in train mode
     """
 
+    policy: EqRPolicy
+
     def __init__(
         self,
         policy: EqRPolicy,
@@ -64,18 +130,17 @@ class Objective:
         aux_gradient_share: float | None = None,
         target_is_copied: bool = False,
     ):
-        self.policy = policy
         self.double_q = double_q
         self.aux_gradient_share = aux_gradient_share
-        self.encoder = policy.online.features_extractor
-        if isinstance(trunk_of(self.encoder), (MlpExtractor, FlattenExtractor)):
-            shift_pixels, intensity_scale = 0, 0.0  # it takes each pixel for a number of its own
-        self.augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
-        is_online = target_is_copied and ignores_mode(self.encoder)
-        self.target_encoder = self.encoder if is_online else policy.target.features_extractor
-        of_latent = self.target_encoder if policy.options.latent_tau is None else self.encoder
-        self.latent_encoder = policy.latent_encoder or of_latent
-        self.target_dtype = th.bfloat16 if policy.bfloat16_targets else th.float32
+        encoder = policy.online.features_extractor
+        if is_flat(encoder):
+            shift_pixels, intensity_scale = 0, 0.0
+        is_online = target_is_copied and ignores_mode(encoder)
+        self.target_encoder = encoder if is_online else policy.target.features_extractor
+        of_latent = self.target_encoder if policy.options.latent_tau is None else encoder
+        augment = Augmentation(policy.observation_space, policy.normalize_images, shift_pixels, intensity_scale)
+        dtype = th.bfloat16 if policy.bfloat16_targets else th.float32
+        super().__init__(policy, encoder, policy.latent_encoder or of_latent, augment, dtype)
 
     def __call__(self, samples: SequenceReplayBufferSamples, coefs: Mapping[str, float]) -> LossTerms:
         """
@@ -122,79 +187,15 @@ class Objective:
         with th.no_grad():
             return loss, priorities, online.expectation(current)
 
-    def latent_losses(
-        self, names: list[str], samples: SequenceReplayBufferSamples, observations: PyTorchObs, features: th.Tensor
-    ) -> dict[str, th.Tensor]:
-        """The auxiliary losses along the rollout. The target encoder sees s_t with the online encoder's augmentation."""
-        rollout, mask, rewards = samples.rollout_observations, samples.mask, samples.rollout_rewards
-        assert rollout is not None and mask is not None and rewards is not None and samples.rollout_actions is not None
-        latent_model, target_features, target_rollout = self.policy.latent_model, None, None
-        with th.no_grad():
-            if latent_model.NEED_FEATURES.intersection(names):
-                is_same = self.latent_encoder is self.encoder
-                target_features = features if is_same else self.encode(self.latent_encoder, observations)
-            if latent_model.NEED_ROLLOUT.intersection(names):
-                augmented = self.augment(flat(rollout), self.target_dtype)
-                target_rollout = self.encode(self.latent_encoder, augmented)  # (B * M, F)
-        # After the end of an episode, action 0: what follows must not leak through batch statistics.
-        actions = self.policy.embed_actions(samples.rollout_actions * mask.long())  # (B, M, A)
-        target = self.policy.latent_target
-        return latent_model(names, features, actions, rewards, mask, target, target_features, target_rollout)
-
-    def encode(self, encoder: nn.Module, observations: PyTorchObs) -> th.Tensor:
-        """Features without gradient, (B, F), of augmented observations, (B, *obs_shape)."""
-        if self.target_dtype == th.float32:
-            return encoder(observations)
-        with th.autocast(self.policy.device.type, self.target_dtype, cache_enabled=False):
-            return encoder(observations).float()
-
 
 def of_actions(outputs: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Select the outputs of a head, (B, N, A), for given actions, (B, 1): (B, N)."""
     return th.take_along_dim(outputs, actions[..., None], dim=2).squeeze(dim=2)
 
 
-class Augmentation:
-    """
-    Prepare observations for the networks in an update: shift images (also those in a dict), scale their intensity, then apply
-    SB3's ``preprocess_obs``.
-
-    :param observation_space: of the observations
-    :param normalize_images: whether images are bytes, which SB3 divides by 255, or already floats
-    :param shift_pixels: maximum shift, ≥ 0, but at most one for each ``SIDE_PER_PIXEL`` pixels of the smaller side: a shift
-        by 4 would move most of an image of 7×7 out of sight
-    :param intensity_scale: of the random intensity, ≥ 0
-    """
-
-    SIDE_PER_PIXEL = 16  # Table 5 has 4 for 84 pixels, one for each 21
-
-    def __init__(self, observation_space: spaces.Space, normalize_images: bool, shift_pixels: int, intensity_scale: float):
-        is_dict = isinstance(observation_space, spaces.Dict)
-        self._spaces = observation_space.spaces if is_dict else {"": observation_space}  # type: ignore[attr-defined]
-        self.image_keys = [k for k, s in self._spaces.items() if is_image_space(s, normalized_image=not normalize_images)]
-        self._normalize_images = normalize_images
-        sides = {key: min(self._spaces[key].shape[-2:]) for key in self.image_keys}  # type: ignore[index]
-        self.shifts = {key: min(shift_pixels, side // self.SIDE_PER_PIXEL) for key, side in sides.items()}
-        self.intensity_scale = intensity_scale
-
-    def __call__(self, observations: PyTorchObs, dtype: th.dtype = th.float32) -> PyTorchObs:
-        """
-        Map observations, (B, *obs_shape) or a dict of these, to floats for a features extractor; ``dtype`` is that of images.
-        """
-        if isinstance(observations, dict):
-            return {key: self._part(key, obs, dtype) for key, obs in observations.items()}
-        return self._part("", observations, dtype)
-
-    def _part(self, key: str, observations: th.Tensor, dtype: th.dtype) -> th.Tensor:
-        if key in self.image_keys:
-            if self.shifts[key] > 0:
-                observations = random_shift(observations, self.shifts[key])
-            if self.intensity_scale > 0:  # in one pass with the division of preprocess_obs: this is the largest tensor
-                unit = 1 / 255 if self._normalize_images else 1.0
-                return random_intensity(observations, self.intensity_scale, unit, dtype)
-            if self._normalize_images:
-                return observations.to(dtype) / 255  # as preprocess_obs, in one pass
-        return preprocess_obs(observations, self._spaces[key], self._normalize_images)  # type: ignore[return-value]
+def valid_actions(actions: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    """Actions, (B, M) or (B, M, A), with action 0 where the mask, (B, M), is 0."""
+    return actions * mask.view(*mask.shape, *[1] * (actions.ndim - 2)).to(actions.dtype)
 
 
 def flat(observations: PyTorchObs) -> PyTorchObs:

@@ -14,22 +14,23 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, check_arguments, with_fields_of
-from sb3_eqr.common.checks.validation import check_names
+from sb3_eqr.common.checks.arguments import POLICY, check_arguments, with_fields_of
+from sb3_eqr.common.checks.validation import check_policy_kwargs
 from sb3_eqr.common.groups import GroupLayer, NoGroup, Whitening
 from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.latent.latent_model import LatentModel, frozen_copy
 from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.networks.encoders import (
     ConvTrunk,
-    DictExtractor,
     GroupFeaturesExtractor,
     ImageExtractor,
     MlpExtractor,
     find_trunk,
     make_trunk,
     trunk_of,
+    with_image_scale,
 )
+from sb3_eqr.common.networks.inputs import keys_of
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead
 from sb3_eqr.common.networks.optimizers import decay_matrices_only, find_optimizer
 from sb3_eqr.common.networks.q_networks import EqRNetwork
@@ -117,7 +118,7 @@ class EqRPolicy(BasePolicy):
     ):
         check_arguments(locals(), POLICY)
         options = {found.name: kwargs.pop(found.name) for found in fields(LatentOptions) if found.name in kwargs}
-        self._check_names(kwargs)
+        check_policy_kwargs(self, EqRPolicy, kwargs)
         self.options = LatentOptions(**options)
         if self.options.transition == "convolutional" and layer_norm:
             raise ValueError(
@@ -147,17 +148,6 @@ class EqRPolicy(BasePolicy):
             **kwargs,
         )
 
-    def _check_names(self, kwargs: dict[str, Any]) -> None:
-        """Raise TypeError for an argument that neither this policy nor SB3's has."""
-        if misplaced := sorted(kwargs.keys() & ALGORITHM.keys()):
-            name = misplaced[0]
-            raise TypeError(f"policy_kwargs: {name!r} is an argument of the agent. Pass {name}=... beside policy_kwargs.")
-        stock = inspect.signature(super().__init__).parameters
-        if any(name not in stock for name in kwargs):
-            own = [inspect.signature(kind.__init__).parameters for kind in (type(self), EqRPolicy)]  # type: ignore[misc]
-            names = {name for parameters in own for name in list(parameters)[4:]} - {"kwargs"}
-            check_names(f"policy_kwargs: {type(self).__name__}", kwargs, sorted(names))
-
     @property
     def online(self) -> EqRNetwork:
         """The network that is trained, and that acts unless ``act_with_target``."""
@@ -168,11 +158,19 @@ class EqRPolicy(BasePolicy):
         """The target copy of the online network."""
         raise AttributeError(f"{type(self).__name__} must define `target`")
 
+    @property
+    def encoder(self) -> BaseFeaturesExtractor:
+        """The encoder that is trained: features for the latent model."""
+        return self.online.features_extractor
+
+    @property
+    def typical_actions(self) -> th.Tensor:
+        """All actions, (A,), int64: those that diagnostics show."""
+        return th.arange(int(self.action_space.n), device=self.device)
+
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Create the trunk, with the group encoder on top of it if the Q head takes group elements."""
-        trunk_kwargs = dict(self.features_extractor_kwargs)
-        if not self.normalize_images and issubclass(self.features_extractor_class, (ImageExtractor, DictExtractor)):
-            trunk_kwargs["normalized_image"] = True  # SB3 does this for its own extractors
+        trunk_kwargs = with_image_scale(self.features_extractor_class, self.features_extractor_kwargs, self.normalize_images)
         is_encoder = issubclass(self.features_extractor_class, GroupFeaturesExtractor)
         if is_encoder and self.options.group is not None and self.head_input == "trunk":
             raise ValueError(
@@ -239,9 +237,8 @@ class EqRPolicy(BasePolicy):
     @property
     def description(self) -> dict[str, str]:
         """Properties that the parameters' shapes do not determine, by name; saved in the model's file."""
-        keys = list(self.observation_space.spaces) if isinstance(self.observation_space, spaces.Dict) else []
         group = "no group" if self.group_layer is None else self.group_layer.description
-        return {"group": group, "observation keys": ", ".join(keys)}  # in the order in which they are concatenated
+        return {"group": group, "observation keys": keys_of(self.observation_space)}
 
     def _make_latent_model(self) -> LatentModel:
         encoder, head, options = self.online.features_extractor, self.online.head, self.options

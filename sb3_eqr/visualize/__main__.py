@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sb3_eqr import AGENTS
 from sb3_eqr.common.checks.arguments import SuggestingParser
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import Play, encode, names_of_factors, play
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{FLAGS.get(name, name)}{space}{message}") from error
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
-    actions, factors = action_names(env, model.policy.latent_model.action_dim), factor_names(env)
+    actions, factors = action_names(env, model), factor_names(env)
     periodic = (env.get_attr("metadata", 0)[0] or {}).get("periodic", ())
     tables = all_tables(diagnostics, actions, factors)
     write_tables(tables, folder)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"Written: {folder}")
 
 
-def latent_figures(model: EqRAlgorithm, played: Play, factors: list[str], periodic: Sequence[str] = ()) -> dict[str, Figure]:
+def latent_figures(model: EqROffPolicy, played: Play, factors: list[str], periodic: Sequence[str] = ()) -> dict[str, Figure]:
     """One figure coloured by time, or one per true factor; ``periodic`` has the keys of ``info`` whose factors are."""
     states = encode(model, played.samples.observations)
     if played.factors is None:

@@ -7,7 +7,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
 
 from sb3_eqr.common.checks.arguments import check, integer
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import check_agent, encode, group_model, replayed
 from sb3_eqr.visualize.pictures import latent_figure
@@ -38,7 +38,7 @@ class LatentCallback(BaseCallback):
         SPR's convolutional transition
     """
 
-    model: EqRAlgorithm
+    model: EqROffPolicy
 
     def __init__(self, log_freq: int = 5000, n_windows: int = 256, pictures: bool = True, verbose: int = 0):
         super().__init__(verbose)

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 from torch.nn import functional as F
 
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.visualize import findings, measures
 from sb3_eqr.visualize.latents import Play, action_elements, check_agent, each_block, eval_mode, latents
 from sb3_eqr.visualize.measures import Rewards, Transition, mean_of_known
@@ -74,7 +74,7 @@ class Diagnostics(NamedTuple):
         }
 
 
-def diagnose(model: EqRAlgorithm, play: Play, seed: int = 0) -> Diagnostics:
+def diagnose(model: EqROffPolicy, play: Play, seed: int = 0) -> Diagnostics:
     """
     Compute all metrics. No global random generator is used.
 

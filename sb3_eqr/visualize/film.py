@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from torch.utils.data import default_collate
 
 from sb3_eqr.common.checks.arguments import check, integer
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, NoGroup
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.plot_style import GREY, INK
@@ -45,7 +45,7 @@ class Film(NamedTuple):
     observations: Any  # (T, *obs_shape), or a dict of these: s_t, the network's input
     pictures: Sequence[np.ndarray]  # T of (height, width, 3), uint8, or of (n,): numbers in [-1, 1], drawn as bars
     titles: Sequence[str]  # (T,): the step of the episode, its action, its reward and the score
-    actions: np.ndarray  # (T,), int64: a_t
+    actions: np.ndarray  # (T,), int64, or (T, action_dim): a_t, as in the replay buffer
     starts: np.ndarray  # (T,), int64: the step at which each step's episode began
 
 
@@ -59,7 +59,7 @@ class Panel(NamedTuple):
 
 
 def record(
-    model: EqRAlgorithm,
+    model: EqROffPolicy,
     env: GymEnv | str,
     path: str | pathlib.Path,
     n_steps: int = 200,
@@ -95,11 +95,11 @@ def record(
     return write_video(frames(film, [panel(*block) for block in blocks[:MAX_PANELS]], about, depth), pathlib.Path(path))
 
 
-def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deterministic: bool) -> Film:
+def shoot(model: EqROffPolicy, env: GymEnv | str, n_steps: int, seed: int, deterministic: bool) -> Film:
     """Run the agent; parameters as in :func:`record`. Seeds the global generators."""
     env = latents.as_vec_env(model, env)
     normalize, obs = unwrap_vec_normalize(env), latents.reset(model, env, seed)
-    names = action_names(env, int(model.policy.action_space.n))
+    names = action_names(env, model)
     rows, start, score = [], 0, 0.0
     for t in range(n_steps):
         seen = latents.each_part(obs, lambda x: x[0])
@@ -108,8 +108,9 @@ def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deter
         obs, rewards, dones, _ = env.step(chosen)
         reward = float((rewards if normalize is None else normalize.get_original_reward())[0])
         score = reward + (0.0 if t == start else score)
-        did = f"step {t - start:<5d} action {names[chosen[0]][:14]:<14s}"
-        rows.append((seen, picture, f"{did} reward {reward:<+8.3g} score {score:<8.4g}", int(chosen[0]), start))
+        name = names[chosen[0]][:14] if np.ndim(chosen[0]) == 0 else " ".join(f"{part:+.1f}" for part in chosen[0][:3])
+        title = f"step {t - start:<5d} action {name:<14s} reward {reward:<+8.3g} score {score:<8.4g}"
+        rows.append((seen, picture, title, latents.stored(model, chosen)[0], start))
         start = t + 1 if dones[0] else start
     observations, pictures, titles, actions, starts = zip(*rows, strict=True)
     seen = default_collate(list(observations))
@@ -118,9 +119,10 @@ def shoot(model: EqRAlgorithm, env: GymEnv | str, n_steps: int, seed: int, deter
     return Film(seen, pictures, titles, np.array(actions), np.array(starts))
 
 
-def predictions(model: EqRAlgorithm, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
+def predictions(model: EqROffPolicy, states: th.Tensor, actions: np.ndarray, starts: np.ndarray, depth: int) -> th.Tensor:
     """What was predicted M = ``depth`` steps before x₀, (T, D), was seen; NaN in the first M steps of an episode."""
-    since = th.as_tensor(actions, device=states.device).unfold(0, depth, 1)[:-1]  # (T - M, M)
+    each = np.arange(len(states) - depth)[:, None] + np.arange(depth)
+    since = th.as_tensor(actions[each], device=states.device)  # (T - M, M, ...)
     with th.no_grad(), latents.eval_mode(model):
         predicted = model.policy.latent_model.rollout(states[:-depth], model.policy.embed_actions(since))[:, -1]
     is_old = th.as_tensor(np.arange(len(states)) - starts >= depth, device=states.device)

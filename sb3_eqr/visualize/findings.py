@@ -6,10 +6,10 @@ import numpy as np
 import torch as th
 from torch.nn import functional as F
 
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO
 from sb3_eqr.common.losses import normalized_distance
 from sb3_eqr.common.networks.encoders import trunk_of
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.type_aliases import PyTorchObs
 from sb3_eqr.visualize import latents, measures
 
@@ -64,23 +64,23 @@ class Collapse(NamedTuple):
     dormant_units: float  # fraction with mean |h| ≤ 0.025 of the layer's mean
 
 
-def find_motion(model: EqRAlgorithm, data: latents.Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
+def find_motion(model: EqROffPolicy, data: latents.Latents, states: th.Tensor, elements: th.Tensor) -> Motion:
     """
     Motion by the elements κ of every action, (n, A, D), in states, (n, D). Distances in the block rather than sizes of κ: they
     are defined for every group, including "none", and have the units of the transition error.
     """
     latent_model = latents.group_model(model)
-    n_actions = latent_model.action_dim
+    n_actions = elements.shape[1]
     before = states.repeat_interleave(n_actions, dim=0)  # (n * A, D)
     moved = latent_model.act(latent_model.blocks(elements.flatten(0, 1)), before)
     predicted = _block_norms(model, moved - before).unflatten(0, (-1, n_actions)).mean(dim=0)  # (A, K)
     steps = _block_norms(model, data.next_states[:, 0] - data.states)  # (N, K)
-    played = F.one_hot(data.actions[:, 0], n_actions).to(steps.dtype)  # (N, A)
+    played = F.one_hot(latents.nearest_typical(model, data.actions[:, 0]), n_actions).to(steps.dtype)  # (N, A)
     observed = played.T @ steps / played.sum(dim=0)[:, None]  # 0 / 0 if never taken
     return Motion(_numpy(predicted), _numpy(observed))
 
 
-def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators]:
+def find_generators(model: EqROffPolicy, elements: th.Tensor) -> list[Generators]:
     """Statistics of κ, of every action in n states, (n, A, D)."""
     found = []
     for group, blocks in latents.split(model, elements):
@@ -93,7 +93,7 @@ def find_generators(model: EqRAlgorithm, elements: th.Tensor) -> list[Generators
 
 
 def find_disentanglement(
-    model: EqRAlgorithm, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
+    model: EqROffPolicy, states: th.Tensor, factors: np.ndarray | None, motion: Motion, generators: list[Generators]
 ) -> Disentanglement:
     """
     Of states, (N, D), and true factors, (N, F), if known. A block's information about a factor is that of its rotation or of
@@ -119,7 +119,7 @@ def _information(parts: list[np.ndarray], factor: np.ndarray) -> float:
     return max(measures.mutual_information(part, factor) for part in parts) / whole if whole > 0 else np.nan
 
 
-def find_action_symmetry(model: EqRAlgorithm, data: latents.Latents, rng: np.random.Generator) -> ActionSymmetry | None:
+def find_action_symmetry(model: EqROffPolicy, data: latents.Latents, rng: np.random.Generator) -> ActionSymmetry | None:
     """The effect of ρ in Eq. 19, computed with the online networks only; ``rng`` draws each state's partner."""
     latent_model, n = latents.group_model(model), len(data.states)
     group = latent_model.group
@@ -143,7 +143,7 @@ def find_action_symmetry(model: EqRAlgorithm, data: latents.Latents, rng: np.ran
     return ActionSymmetry(*(float(x.mean()) for x in (*distances, away)))
 
 
-def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchObs) -> Collapse:
+def find_collapse(model: EqROffPolicy, states: th.Tensor, observations: PyTorchObs) -> Collapse:
     """The collapse of states, (N, D), and of the units that encode their observations, N."""
     size = float(states.double().square().sum(dim=1).mean().sqrt())
     spectrum = measures.spectrum(states)
@@ -157,9 +157,9 @@ def find_collapse(model: EqRAlgorithm, states: th.Tensor, observations: PyTorchO
     return Collapse(size, spread, rank, states.shape[1], spectrum, len(dead), *fractions)
 
 
-def _trunk_outputs(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
+def _trunk_outputs(model: EqROffPolicy, observations: PyTorchObs) -> th.Tensor:
     """The outputs of the trunk, (N, U)."""
-    trunk = trunk_of(model.policy.online.features_extractor)  # after a layer norm, a unit that is always 0 is not constant
+    trunk = trunk_of(model.policy.encoder)  # after a layer norm, a unit that is always 0 is not constant
     seen: list[th.Tensor] = []
     hook = trunk.register_forward_hook(lambda _module, _inputs, output: seen.append(output.flatten(1)))
     try:
@@ -169,7 +169,7 @@ def _trunk_outputs(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     return th.cat(seen)
 
 
-def _block_norms(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
+def _block_norms(model: EqROffPolicy, states: th.Tensor) -> th.Tensor:
     """The size of each block of flat states, (N, D) to (N, K)."""
     return th.cat([found.flatten(2).norm(dim=2) for _, found in latents.split(model, states)], dim=1)
 

@@ -14,11 +14,11 @@ from stable_baselines3.common.utils import check_for_correct_spaces, set_random_
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr.common.checks.arguments import check, integer
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SE, SO, Group, MatrixGroup, NoGroup, ProductGroup, T
 from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.latent.latent_model import LatentModel
-from sb3_eqr.common.objective import flat
+from sb3_eqr.common.objective import flat, valid_actions
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
@@ -42,7 +42,7 @@ class Latents(NamedTuple):
     next_states: th.Tensor  # (N, M, D): x₁ ... x_M, encoded
     predicted: th.Tensor  # (N, M, D): x̂₁ ... x̂_M, rolled out from x₀
     predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m); the expected sign if the reward loss is categorical
-    actions: th.Tensor  # (N, M), int64
+    actions: th.Tensor  # (N, M), int64, or (N, M, action_dim) for Box actions
     rewards: th.Tensor  # (N, M)
     mask: th.Tensor  # (N, M): 1 where the episode had not ended before step t+m
 
@@ -56,12 +56,12 @@ class Blocks(NamedTuple):
 
 def check_agent(name: str, model: Any) -> None:
     """Raise a ValueError, with the name of the caller, if the model is not an EqR agent."""
-    if not isinstance(model, EqRAlgorithm):
+    if not isinstance(model, EqROffPolicy) or not hasattr(model.policy, "latent_model"):
         found = type(model).__name__
-        raise ValueError(f"{name} needs an EqR agent (EqRQRDQN, EqRRainbow), got {found}, which has no latent model.")
+        raise ValueError(f"{name} needs an EqR agent with a latent model, got {found}, which has none.")
 
 
-def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
+def as_vec_env(model: EqROffPolicy, env: GymEnv | str) -> VecEnv:
     """The environment, or that with this gymnasium id, with images channels first; a ValueError if its spaces are others."""
     found = model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
     try:
@@ -71,7 +71,7 @@ def as_vec_env(model: EqRAlgorithm, env: GymEnv | str) -> VecEnv:
     return found
 
 
-def reset(model: EqRAlgorithm, env: VecEnv, seed: int) -> Any:
+def reset(model: EqROffPolicy, env: VecEnv, seed: int) -> Any:
     """Seed the environment and all generators, including that of the agent's ε-greedy actions; returns the observations."""
     set_random_seed(seed)
     model.action_space.seed(seed)
@@ -80,7 +80,7 @@ def reset(model: EqRAlgorithm, env: VecEnv, seed: int) -> Any:
 
 
 def play(
-    model: EqRAlgorithm, env: GymEnv | str, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
+    model: EqROffPolicy, env: GymEnv | str, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
 ) -> Play:
     """
     Run the agent and collect windows of its steps. All random generators except the environments' keep their states.
@@ -108,7 +108,7 @@ def play(
             factors.append(_factors(infos))
             actions, _ = model.predict(obs, deterministic=deterministic)
             new_obs, rewards, dones, infos = env.step(actions)
-            buffer.add(obs, _true_next(new_obs, dones, infos), actions, rewards, dones, infos)
+            buffer.add(obs, _true_next(new_obs, dones, infos), stored(model, actions), rewards, dones, infos)
             infos = [
                 env.unwrapped.reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))
             ]
@@ -117,6 +117,11 @@ def play(
     samples = buffer.windows(starts, envs)  # already normalised by a VecNormalize
     known = all(found is not None for found in factors)
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
+
+
+def stored(model: EqROffPolicy, actions: np.ndarray) -> np.ndarray:
+    """Actions as the replay buffer has them: those of a Box are scaled to [-1, 1]."""
+    return model.policy.scale_action(actions) if isinstance(model.action_space, spaces.Box) else actions
 
 
 def _space(obs: Any, space: spaces.Space) -> spaces.Space:
@@ -151,7 +156,7 @@ def _true_next(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> 
     return found
 
 
-def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> Play:
+def replayed(model: EqROffPolicy, n_windows: int, rng: np.random.Generator) -> Play:
     """
     Windows drawn uniformly from the agent's replay buffer; no global random generator is used.
 
@@ -171,7 +176,7 @@ def replayed(model: EqRAlgorithm, n_windows: int, rng: np.random.Generator) -> P
     return Play(buffer.windows(starts, envs, model.get_vec_normalize_env()), None)
 
 
-def group_model(model: EqRAlgorithm) -> LatentModel:
+def group_model(model: EqROffPolicy) -> LatentModel:
     """The agent's latent model; raises a ValueError if it does not use groups."""
     found = model.policy.latent_model
     if isinstance(found, ConvLatentModel):
@@ -182,7 +187,7 @@ def group_model(model: EqRAlgorithm) -> LatentModel:
     return found
 
 
-def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
+def encode(model: EqROffPolicy, observations: PyTorchObs) -> th.Tensor:
     """
     x = τ(s), computed by the online encoder in eval mode.
 
@@ -193,11 +198,12 @@ def encode(model: EqRAlgorithm, observations: PyTorchObs) -> th.Tensor:
     """
     check_agent("encode", model)
     n = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    policy: Any = model.policy
     states = []
     with th.no_grad(), eval_mode(model):
         for start in range(0, n, CHUNK):
             chunk = each_part(observations, lambda obs, s=start: obs[s : s + CHUNK].to(model.device))
-            states.append(model.policy.latent_model.embedding(model.policy.online.features(chunk)))
+            states.append(policy.latent_model.embedding(policy.extract_features(chunk, policy.encoder)))
     return th.cat(states)
 
 
@@ -208,7 +214,7 @@ def each_part(observations: Any, function: Any) -> Any:
     return function(observations)
 
 
-def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latents:
+def latents(model: EqROffPolicy, samples: SequenceReplayBufferSamples) -> Latents:
     """
     :param model: any EqR agent
     :param samples: N windows with rollouts, M ≥ 1
@@ -217,7 +223,7 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     assert samples.mask is not None and samples.rollout_actions is not None and samples.rollout_rewards is not None
     assert samples.rollout_observations is not None
     mask = samples.mask.to(model.device)
-    actions = (samples.rollout_actions.to(model.device) * mask.long()).long()
+    actions = valid_actions(samples.rollout_actions.to(model.device), mask)
     states = encode(model, samples.observations)
     following = encode(model, flat(samples.rollout_observations))  # (N * M, D)
     rewards, latent_model = samples.rollout_rewards.to(model.device), model.policy.latent_model
@@ -230,22 +236,29 @@ def latents(model: EqRAlgorithm, samples: SequenceReplayBufferSamples) -> Latent
     return Latents(states, following, predicted, outputs.view(mask.shape), actions, rewards, mask)
 
 
-def action_elements(model: EqRAlgorithm, states: th.Tensor) -> th.Tensor:
+def action_elements(model: EqROffPolicy, states: th.Tensor) -> th.Tensor:
     """
-    κ(x, a) of every action in every state.
+    κ(x, a) of every typical action in every state.
 
     :param states: (N, D)
     :return: flat like the states, (N, A, D), without gradient
     """
     latent_model = group_model(model)
-    n, n_actions = len(states), latent_model.action_dim
-    actions = th.arange(n_actions, device=states.device).repeat(n)  # (N * A,)
+    n, typical = len(states), model.policy.typical_actions
+    n_actions = len(typical)
+    actions = typical.repeat(n, *[1] * (typical.ndim - 1))  # (N * A, ...)
     with th.no_grad(), eval_mode(model):
         elements = latent_model.action_element(states.repeat_interleave(n_actions, dim=0), model.policy.embed_actions(actions))
     return elements.flatten(1).unflatten(0, (n, n_actions))
 
 
-def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
+def nearest_typical(model: EqROffPolicy, actions: th.Tensor) -> th.Tensor:
+    """The number of the typical action that is nearest to each action, (N,), of discrete actions, (N,), or others, (N, A)."""
+    typical = model.policy.typical_actions
+    return actions if typical.ndim == 1 else (actions @ typical.mT).argmax(dim=1)
+
+
+def split(model: EqROffPolicy, states: th.Tensor) -> list[Blocks]:
     """
     :param states: states or elements of actions, (..., D)
     :return: the blocks, one entry per group; each factor of a product has its own entry
@@ -260,7 +273,7 @@ def split(model: EqRAlgorithm, states: th.Tensor) -> list[Blocks]:
     return [Blocks(factor, piece.flatten(states.dim() - 1, states.dim())) for factor, piece in pieces]
 
 
-def each_block(model: EqRAlgorithm, states: th.Tensor) -> list[tuple[str, Group, th.Tensor]]:
+def each_block(model: EqROffPolicy, states: th.Tensor) -> list[tuple[str, Group, th.Tensor]]:
     """Name, such as "SE(2) 0", group and elements, (..., *element_shape), of each block of states, (..., D)."""
     return [
         (f"{group} {i}", group, block)
@@ -329,7 +342,7 @@ def _rotation_log(rotation: th.Tensor) -> th.Tensor:
 
 
 @contextmanager
-def eval_mode(model: EqRAlgorithm) -> Iterator[None]:
+def eval_mode(model: EqROffPolicy) -> Iterator[None]:
     """Put the policy into eval mode, and restore its modes on exit."""
     modes = [(module, module.training) for module in model.policy.modules()]
     model.policy.eval()

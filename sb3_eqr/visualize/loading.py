@@ -14,13 +14,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 import sb3_eqr.envs
 from sb3_eqr import AGENTS
 from sb3_eqr.common.checks.arguments import nearest
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.models import data_of, read_model
 from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.visualize.latents import FACTOR_KEYS, as_vec_env
 
 
-def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqRAlgorithm:
+def load_model(path: pathlib.Path, algo: str | None = None, device: str = "auto", trust: bool = False) -> EqROffPolicy:
     """
     :param path: path of a file written by ``save``
     :param algo: one of ``AGENTS``; default: detected from the file
@@ -55,7 +55,7 @@ def find_algorithm(path: pathlib.Path) -> str:
 
 
 def make_env(
-    model: EqRAlgorithm,
+    model: EqROffPolicy,
     path: pathlib.Path,
     env_id: str | None = None,
     env_kwargs: dict[str, Any] | None = None,
@@ -160,8 +160,12 @@ def parse_kwargs(pairs: list[str]) -> dict[str, Any]:
     return found
 
 
-def action_names(env: VecEnv, n_actions: int) -> list[str]:
-    """The environment's names of its actions, or else their numbers."""
+def action_names(env: VecEnv, model: EqROffPolicy) -> list[str]:
+    """The environment's names of its actions, or else their numbers; of a Box, names of the typical actions."""
+    typical = model.policy.typical_actions
+    if typical.ndim == 2:
+        return [f"{sign}{axis}" for axis in range(typical.shape[1]) for sign in "+-"]
+    n_actions = len(typical)
     world = env.get_attr("unwrapped", 0)[0]
     names = world.get_action_meanings() if hasattr(world, "get_action_meanings") else []
     return list(names) if len(names) == n_actions else [str(a) for a in range(n_actions)]

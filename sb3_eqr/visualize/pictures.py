@@ -13,8 +13,8 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.common.groups import SO, Group
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.plot_style import COLORS, GREY, LINES, MARKERS, styled
 from sb3_eqr.visualize.diagnostics import Diagnostics
@@ -220,7 +220,7 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
 
 
 def latent_figure(
-    model: EqRAlgorithm, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", is_periodic: bool = False
+    model: EqROffPolicy, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", is_periodic: bool = False
 ) -> Figure:
     """
     A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in

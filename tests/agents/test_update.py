@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import GroupFeaturesExtractor
-from sb3_eqr.common import objective
+from sb3_eqr.common.networks import inputs
 from sb3_eqr.common.networks.encoders import NormalizedExtractor
 from tests.models import EITHER, MAKERS, PAPER, loss_terms, tensors, train_on
 from tests.toys import ChainEnv, ImageEnv, SampledEnv
@@ -309,8 +309,8 @@ def test_a_fused_optimizer_trains_as_a_plain_one(make, images):
 def test_online_and_target_observations_are_augmented(make, monkeypatch):
     model = make(ImageEnv(), "CnnPolicy").learn(44)
     seen = []
-    shift = objective.random_shift
-    monkeypatch.setattr(objective, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))
+    shift = inputs.random_shift
+    monkeypatch.setattr(inputs, "random_shift", lambda x, pad: seen.append(len(x)) or shift(x, pad))
     model.train(1, 8)
     assert seen == [8, 8, 16]
 
@@ -336,7 +336,7 @@ def test_float_images_keep_their_scale(normalize_images, low, high):
     """Intensities are drawn from 1 ± 0.05 clipped at two standard deviations; only bytes are divided by 255."""
     space = spaces.Box(0, 255, (1, 36, 36), np.uint8) if normalize_images else spaces.Box(0, 1, (1, 36, 36), np.float32)
     ones = th.ones((64, *space.shape), dtype=th.uint8 if normalize_images else th.float)
-    found = objective.Augmentation(space, normalize_images, 0, 0.05)(ones)
+    found = inputs.Augmentation(space, normalize_images, 0, 0.05)(ones)
     assert low - 1e-6 <= found.min() < found.max() <= high + 1e-6
 
 
@@ -388,4 +388,4 @@ def test_no_piece_is_shifted_out_of_a_small_board(make, policy):
 @pytest.mark.parametrize("side, shift", [(84, 4), (64, 4), (40, 2), (15, 0)])
 def test_the_shift_is_small_for_the_image(side, shift):
     space = spaces.Dict({"picture": spaces.Box(0, 255, (1, side, 96), np.uint8), "speed": spaces.Box(-1, 1, (2,))})
-    assert objective.Augmentation(space, True, 4, 0.0).shifts == {"picture": shift}
+    assert inputs.Augmentation(space, True, 4, 0.0).shifts == {"picture": shift}

@@ -15,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_eqr.common.checks.arguments import POLICY, nearest
+from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, nearest
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
@@ -109,6 +109,18 @@ def answers_misspelt(**elsewhere: type) -> Callable[[Callable[P, None]], Callabl
     return decorator
 
 
+def check_policy_kwargs(policy: Any, base: type, kwargs: Iterable[str]) -> None:
+    """Raise TypeError for an argument that neither a policy, nor ``base``, which it derives from, nor SB3's policy takes."""
+    if misplaced := sorted(name for name in kwargs if name in ALGORITHM):
+        name = misplaced[0]
+        raise TypeError(f"policy_kwargs: {name!r} is an argument of the agent. Pass {name}=... beside policy_kwargs.")
+    stock = inspect.signature(super(base, policy).__init__).parameters  # type: ignore[misc, arg-type]
+    if any(name not in stock for name in kwargs):
+        own = [inspect.signature(kind.__init__).parameters for kind in (type(policy), base)]  # type: ignore[misc]
+        names = {name for parameters in [*own, stock] for name in list(parameters)[3:]} - {"kwargs"}
+        check_names(f"policy_kwargs: {type(policy).__name__}", kwargs, sorted(names))
+
+
 def check_env(env: Any) -> None:
     """Raise ValueError if this is not an environment, but, for example, its class."""
     if not isinstance(env, (gym.Env, VecEnv)):
@@ -123,12 +135,21 @@ def check_action_space(action_space: spaces.Space) -> None:
         raise AssertionError(
             f"The algorithm only supports {spaces.Discrete} as action space, because the Q head has one output per "
             f"action, but {action_space} was provided. Wrap the environment with discrete actions, "
-            "or use an algorithm that supports this space (SAC, TQC, PPO)."
+            "or, for a Box, use EqRSAC or EqRTQC."
         )
     if action_space.start != 0:
         raise AssertionError(
             f"The algorithm only supports action spaces that start at 0, but {action_space} was provided. "
             "Wrap the environment with gymnasium.wrappers.TransformAction."
+        )
+
+
+def check_continuous_actions(action_space: spaces.Space) -> None:
+    """Raise AssertionError, as SB3 does, if the action space is not a Box."""
+    if not isinstance(action_space, spaces.Box):
+        raise AssertionError(
+            f"The algorithm only supports {spaces.Box} as action space, but {action_space} was provided. "
+            "Use EqRQRDQN or EqRRainbow for a Discrete one."
         )
 
 
@@ -212,8 +233,7 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
     """Raise ValueError if the class is not derived from ``base``, or ``kwargs`` contains arguments that the algorithm sets."""
     if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, base)):
         raise ValueError(
-            f"replay_buffer_class must be {base.__name__} or a class derived from it, got {chosen}. "
-            "Leave it out to let prioritized_replay choose the class."
+            f"replay_buffer_class must be {base.__name__} or a class derived from it, got {chosen}. Leave it out."
         )
     for name in (*set_by_owner, *OF_ENV):
         if name in kwargs:
@@ -262,6 +282,12 @@ def warn_of_slow_bfloat16(device: th.device) -> None:
             f"bfloat16_targets=True: PyTorch finds no instructions for bfloat16 on {device.type}, so updates may take longer. "
             "Leave it out."
         )
+
+
+def warn_of_memory_option(optimize_memory_usage: bool) -> None:
+    """Warn if it is asked for."""
+    if optimize_memory_usage:
+        warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each frame only once.")
 
 
 def warn_of_idle_training(last_step: int, learning_starts: int | None, n_updates: int, buffer: Any) -> None:

@@ -136,7 +136,7 @@ class ImageExtractor(BaseFeaturesExtractor):
                 f"Images must be (channels, height, width) with at least {smallest}x{smallest} pixels, got "
                 f"{observation_space.shape}. "
                 "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])), "
-                "and shift_pixels=0, intensity_scale=0.0: docs/own_environment.md."
+                "and no augmentation: docs/own_environment.md."
             )
         trunk = make_trunk(channels)
         with th.no_grad():
@@ -214,6 +214,29 @@ class MlpExtractor(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
+class TwoLayerExtractor(BaseFeaturesExtractor):
+    """
+    Flatten, a linear layer, layer norm, ELU and a second linear layer: an encoder for vectors.
+
+    :param observation_space: any space except ``Dict``
+    :param features_dim: size of both layers
+    """
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
+        check("features_dim", features_dim, integer(1))
+        super().__init__(observation_space, features_dim)
+        flat = FlattenExtractor(observation_space)
+        first, second = nn.Linear(flat.features_dim, features_dim), nn.Linear(features_dim, features_dim)
+        self.layers = nn.Sequential(flat, first, nn.LayerNorm(features_dim), nn.ELU(), second)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Map (B, *obs_shape) to (B, features_dim)."""
+        return self.layers(observations)
+
+
+FLAT = (MlpExtractor, TwoLayerExtractor, FlattenExtractor)  # for vectors
+
+
 class DictExtractor(BaseFeaturesExtractor):
     """
     SB3's ``CombinedExtractor`` with the convolutions of :class:`ConvExtractor`, so that images may be small, and a layer for
@@ -266,6 +289,7 @@ TRUNKS: dict[str, type[BaseFeaturesExtractor]] = {
     "nature": ConvExtractor,
     "impala": ImpalaExtractor,
     "mlp": MlpExtractor,
+    "two_layer": TwoLayerExtractor,
     "flatten": FlattenExtractor,
 }
 
@@ -307,6 +331,17 @@ class NormalizedExtractor(BaseFeaturesExtractor):
         return self.norm(self.center(self.trunk(observations)))
 
 
+def is_flat(encoder: nn.Module) -> bool:
+    """Whether it takes each pixel of an image for a number of its own."""
+    return isinstance(trunk_of(encoder), FLAT)
+
+
+def with_image_scale(trunk_class: type, kwargs: dict[str, Any], normalize_images: bool) -> dict[str, Any]:
+    """The arguments of a trunk, which include whether images are floats, not bytes, as SB3 tells its own extractors."""
+    has_images = issubclass(trunk_class, (ImageExtractor, DictExtractor))
+    return {**kwargs, "normalized_image": True} if has_images and not normalize_images else dict(kwargs)
+
+
 def make_trunk(
     trunk_class: type[BaseFeaturesExtractor],
     observation_space: spaces.Space,
@@ -323,7 +358,7 @@ def make_trunk(
     :return: the trunk
     :raises ValueError: if the trunk is for vectors and the observations are dicts
     """
-    if issubclass(trunk_class, (MlpExtractor, FlattenExtractor)) and isinstance(observation_space, spaces.Dict):
+    if issubclass(trunk_class, FLAT) and isinstance(observation_space, spaces.Dict):
         raise ValueError(
             f"features_extractor_class must accept dicts, got {trunk_class.__name__} for {observation_space}. "
             "Use MultiInputPolicy and leave features_extractor_class out."

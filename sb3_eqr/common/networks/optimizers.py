@@ -44,8 +44,16 @@ def set_adam_defaults(policy_kwargs: dict[str, Any], device: th.device) -> None:
     policy_kwargs.setdefault("optimizer_class", th.optim.Adam)
     if find_optimizer(policy_kwargs["optimizer_class"]) in (th.optim.Adam, th.optim.AdamW):
         given = policy_kwargs.get("optimizer_kwargs") or {}
-        fused = device.type in ("cpu", "cuda") and not (given.get("foreach") or given.get("differentiable"))
-        policy_kwargs["optimizer_kwargs"] = {"eps": ADAM_EPS, "fused": fused, **given}
+        policy_kwargs["optimizer_kwargs"] = {
+            "eps": ADAM_EPS,
+            "fused": device.type in ("cpu", "cuda") and can_fuse(given),
+            **given,
+        }
+
+
+def can_fuse(given: dict[str, Any]) -> bool:
+    """Whether these arguments of Adam go with its fused implementation."""
+    return not (given.get("foreach") or given.get("differentiable"))
 
 
 def decay_matrices_only(model: nn.Module, optimizer: th.optim.Optimizer) -> None:

@@ -1,0 +1,149 @@
+"""What all EqR agents share: environments, replay of windows, the log, and saving."""
+
+import copy
+import inspect
+import io
+from collections.abc import Mapping
+from typing import Any, Self
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
+
+from sb3_eqr.common.checks import validation
+from sb3_eqr.common.checks.arguments import check, number
+from sb3_eqr.common.checks.finite_data import FiniteData
+from sb3_eqr.common.checks.update_monitor import UpdateMonitor
+from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
+from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
+
+# Arguments of the replay buffer that the algorithm sets and changes.
+SET_BY_ALGORITHM = ("n_steps", "gamma", "prediction_depth", "buffer_size", "device")
+
+
+class EqROffPolicy(FiniteData, SafeFiles):
+    """Mixin, listed before an off-policy algorithm of SB3, for an agent with a latent model that learns from windows."""
+
+    policy: Any
+    replay_buffer: SequenceReplayBuffer | None
+    replay_buffer_class: type[SequenceReplayBuffer] | None
+    prediction_depth: int
+    aet_coef: float
+    symmetry_coef: float
+    reward_coef: float
+    policy_description: dict[str, str]
+    frame_stack = 1
+    _monitor: UpdateMonitor
+
+    @property
+    def loss_coefs(self) -> Mapping[str, float]:
+        """The weight λ of each loss by its name."""
+        raise NotImplementedError
+
+    @property
+    def depth(self) -> int:
+        """The effective M: 0 if all auxiliary losses are disabled."""
+        is_used = any(coef for name, coef in self.loss_coefs.items() if name != "td")
+        return self.prediction_depth if is_used else 0
+
+    @classmethod
+    def _check_action_space(cls, action_space: spaces.Space) -> None:
+        """Raise AssertionError, as SB3 does, for an action space that the algorithm does not support."""
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        raise NotImplementedError
+
+    @classmethod
+    def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if any(kind.__module__.split(".")[0] == "gym" for kind in type(env).__mro__):
+            env = _patch_env(env)  # environments of the old gym need shimmy, as in SB3
+        validation.check_env(env)
+        if isinstance(found := getattr(env, "observation_space", None), spaces.Space):
+            validation.check_observation_space(found)
+        with validation.environment_errors(0):
+            wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        cls._check_action_space(wrapped.action_space)
+        return wrapped
+
+    def _new_replay_buffer(self, buffer_class: type[SequenceReplayBuffer], n_steps: int) -> SequenceReplayBuffer:
+        legal = inspect.signature(buffer_class).parameters
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in legal.values()):
+            validation.check_names(f"replay_buffer_kwargs: {buffer_class.__name__}", self.replay_buffer_kwargs, legal)
+        kwargs: dict[str, Any] = {"n_steps": n_steps, "gamma": self.gamma, "prediction_depth": self.depth}
+        kwargs |= {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack, "n_envs": self.n_envs}
+        return buffer_class(self.buffer_size, self.observation_space, self.action_space, self.device, **kwargs)
+
+    def _find_frame_stack(self) -> int:
+        stack: Any = unwrap_vec_wrapper(self.env, VecFrameStack)  # type: ignore[arg-type]
+        found = 1
+        if stack is not None and is_image_space(self.observation_space):
+            # The first axis consists of frames only if VecFrameStack stacked along the channels.
+            if stack.stacked_obs.channels_first == is_image_space_channels_first(stack.venv.observation_space):
+                found = stack.stacked_obs.n_stack
+        return self.replay_buffer_kwargs.get("frame_stack", found)
+
+    def _log_last_round(self, check_model: bool = False) -> None:
+        """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
+        try:
+            for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
+                for name, value in update.items():
+                    self.logger.record_mean(f"train/{name}", value)
+            if check_model:
+                self._monitor.check_model(self._n_updates)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class."""
+        check("total_timesteps", total_timesteps, number(0))
+        log_name = tb_log_name or type(self).__name__
+        super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
+        self._log_last_round(check_model=True)
+        if log_interval is not None:  # SB3 logs only at the end of episodes, so the last updates would be missing
+            self.dump_logs()
+        return self
+
+    def dump_logs(self) -> None:
+        """Write log data; losses are means over all updates since the last call."""
+        self._log_last_round()
+        super().dump_logs()
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution, or if the moments
+        of the optimiser do not fit its parameters. After an error, all parameters are as before.
+        """
+        if not isinstance(load_path_or_dict, dict):
+            content = read_model(load_path_or_dict)
+            validation.check_same_parameters(self.policy_description, data_of(content).get("policy_description", {}))
+            load_path_or_dict = io.BytesIO(content)  # type: ignore[assignment]
+        self._monitor.forget()
+        before: Any = copy.deepcopy(self.get_parameters())
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+            for optimizer in self._optimizers():
+                validation.check_moments(optimizer)
+        except Exception:
+            super().set_parameters(before)  # PyTorch copies the tensors that fit before it raises
+            raise
+        for parameter, state in (item for optimizer in self._optimizers() for item in optimizer.state.items()):
+            for name, value in state.items():
+                if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
+                    state[name] = th.empty_like(parameter).copy_(value)  # fused kernels need the same memory layout
+
+    def _before_saving(self) -> None:
+        self._log_last_round(check_model=True)  # which never writes a model that is not finite
