@@ -27,7 +27,7 @@ USAGE = f"""usage: sb3-eqr COMMAND ...
 
 {LINES}
 
-The first eight are RL Zoo's commands, with its arguments and the agents eqr_qrdqn and eqr_rainbow.
+The first eight are RL Zoo's commands, with its arguments and the agents eqr_qrdqn, eqr_rainbow, eqr_sac, eqr_tqc.
 sb3-eqr COMMAND --help lists the arguments of a command, sb3-eqr --version prints the version.
 
 examples:

@@ -10,6 +10,7 @@ import yaml
 from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
+import sb3_eqr
 from sb3_eqr.benchmark.suites import nearest_name
 from sb3_eqr.configurations import STOCK, configuration_files, merged
 from sb3_eqr.zoo import AGENTS, register
@@ -17,8 +18,8 @@ from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
 
 WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change the environment
 OFF = "off"
-CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq")  # algorithms without support for discrete actions
-DISCRETE = ("dqn", "qrdqn", *AGENTS)  # algorithms that support discrete actions only
+CONTINUOUS = ("ddpg", "td3", "sac", "tqc", "crossq", *sb3_eqr.CONTINUOUS)  # algorithms without support for discrete actions
+DISCRETE = ("dqn", "qrdqn", *sb3_eqr.DISCRETE)  # algorithms that support discrete actions only
 PLAIN = (bool, int, float, str, tuple, list, dict, type(None))
 UNRELATED = ("_init_setup_model", "device", "policy_kwargs", "seed", "tensorboard_log", "verbose")  # not to the scores
 
@@ -49,7 +50,8 @@ def find_agent(text: str) -> Agent:
         theirs = pathlib.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
         return Agent(algo, algo, files[algo] if algo in AGENTS else theirs)
     if entries == OFF and algo in AGENTS:
-        return Agent(text, algo, files[algo], {"prediction_depth": 0, "policy_kwargs": {"group": None}})
+        without = {"group": None} if algo in sb3_eqr.DISCRETE else {"head_input": "observation"}
+        return Agent(text, algo, files[algo], {"prediction_depth": 0, "policy_kwargs": without})
     if match := re.fullmatch(r"(.+\.ya?ml)(?::(.+))?", entries):
         if not pathlib.Path(match[1]).is_file():
             raise ValueError(f"--agents: {text!r}: there is no file {match[1]}")

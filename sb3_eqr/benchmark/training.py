@@ -25,6 +25,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import get_device, should_collect_more_steps
 
+from sb3_eqr import DISCRETE
 from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, STOPPED, Run, Settings, write_json
@@ -34,7 +35,7 @@ from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.models import SafeFiles
 from sb3_eqr.common.saving.plain_data import decode
 from sb3_eqr.envs import import_packages
-from sb3_eqr.zoo import AGENTS, register
+from sb3_eqr.zoo import register
 
 LOGGED = r"train/.*(loss|state_gradient.*)|latent/.*"
 PROGRESS_SECONDS = 2.0  # between writes of a run's progress
@@ -184,7 +185,7 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     with tempfile.TemporaryDirectory() as aside, contextlib.redirect_stdout(io.StringIO()):  # RL Zoo prints
         config = pathlib.Path(aside) / "entry.yml"
         entry = {key: value for key, value in run.entry.items() if value is not None or key not in WORLD}  # null: none
-        if run.agent.algo in AGENTS and get_device(settings.device).type == "cuda":
+        if run.agent.algo in DISCRETE and get_device(settings.device).type == "cuda":
             entry = {"cuda_graph": True, **entry}
         config.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
         manager = ExperimentManager(

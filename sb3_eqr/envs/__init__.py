@@ -14,6 +14,7 @@ from sb3_eqr.envs import minatar
 from sb3_eqr.envs.atari import make_atari100k_env
 from sb3_eqr.envs.blind_cliffwalk import BlindCliffwalk
 from sb3_eqr.envs.pixel_pendulum import PixelPendulum
+from sb3_eqr.envs.planar_body import PlanarBody
 from sb3_eqr.envs.sliding_ball import SlidingBall
 from sb3_eqr.envs.star_field import StarField
 
@@ -25,6 +26,8 @@ WORLDS: dict[str, dict[str, Any]] = {
     "SlidingBallTorus-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100, "kwargs": {"dimensions": 2}},
     "SlidingBallDistractors-v0": {"entry_point": "sb3_eqr.envs:SlidingBall", "max_episode_steps": 100, "kwargs": DISTRACTORS},
     "PixelPendulum-v0": {"entry_point": "sb3_eqr.envs:PixelPendulum", "max_episode_steps": 200},
+    "PlanarBody-v0": {"entry_point": "sb3_eqr.envs:PlanarBody", "max_episode_steps": 50},
+    "PlanarBodyNoise-v0": {"entry_point": "sb3_eqr.envs:PlanarBody", "max_episode_steps": 50, "kwargs": {"n_noise": 20}},
     "StarField-v0": {"entry_point": "sb3_eqr.envs:StarField", "max_episode_steps": 100},
     "StarFieldRotations-v0": {
         "entry_point": "sb3_eqr.envs:StarField",
@@ -51,4 +54,12 @@ def import_packages(packages: Iterable[str]) -> None:
             ) from error
 
 
-__all__ = ["BlindCliffwalk", "PixelPendulum", "ResumableWrapper", "SlidingBall", "StarField", "make_atari100k_env"]
+__all__ = [
+    "BlindCliffwalk",
+    "PixelPendulum",
+    "PlanarBody",
+    "ResumableWrapper",
+    "SlidingBall",
+    "StarField",
+    "make_atari100k_env",
+]

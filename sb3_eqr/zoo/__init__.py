@@ -3,8 +3,8 @@ RL Zoo with the EqR agents: registration, search spaces, and the command line ``
 
     sb3-eqr train --algo eqr_rainbow --env CartPole-v1 --conf-file FILE_OR_NAME ...
 
-Every command is RL Zoo's, with all of its flags. The package adds the agents ``eqr_qrdqn`` and ``eqr_rainbow``, their
-hyperparameter files, and error messages instead of tracebacks.
+Every command is RL Zoo's, with all of its flags. The package adds ``eqr_qrdqn``, ``eqr_rainbow``,
+``eqr_sac`` and ``eqr_tqc``, their hyperparameter files, and error messages instead of tracebacks.
 """
 
 try:

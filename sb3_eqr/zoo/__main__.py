@@ -39,7 +39,7 @@ DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 # Packages of the extra "zoo".
 EXTRA = ("seaborn", "rliable", "scipy", "pytablewriter", "matplotlib", "pandas", "moviepy", "minatar", "Box2D", "pygame")
 
-RESUMING = """train with eqr_qrdqn or eqr_rainbow also takes --checkpoint-every STEPS, which writes checkpoints into the run's
+RESUMING = """train with an agent of this package also takes --checkpoint-every STEPS, which writes checkpoints into the run's
 folder, and --resume FOLDER, which resumes a run from its last one; add --trust if its settings contain Python objects
 """
 
@@ -242,7 +242,11 @@ def explanation(command: str, error: Exception) -> str | None:
     if "observation space is not supported" in str(error):
         return f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these."
     if "as action space" in str(error):
-        advice = "" if "Wrap the environment" in str(error) else " These agents need discrete actions."
+        advice = (
+            ""
+            if "Wrap the environment" in str(error)
+            else " EqRQRDQN and EqRRainbow need discrete actions, EqRSAC and EqRTQC continuous ones."
+        )
         return f"{command}: {str(error).rstrip('.')}.{advice}"
     if command in PLOTS and not isinstance(error, (AssertionError, NotImplementedError)):
         return f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each."

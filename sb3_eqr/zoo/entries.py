@@ -12,16 +12,18 @@ import numpy as np
 import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 
+from sb3_eqr import DISCRETE
 from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, nearest, number
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
-from sb3_eqr.common.policies import EqRPolicy
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.envs.pixels import SMALLEST_PICTURE
 from sb3_eqr.trust import wrapper_names
 from sb3_eqr.zoo.checks import fail, failing
 
+DISCRETE_NAMES = [agent.__name__ for agent in DISCRETE.values()]
 # Keys that RL Zoo removes from an entry before it calls the constructor.
 ENTRY_KEYS = {*ZOO_KEYS, "vec_env_wrapper", "monitor_kwargs", "env_kwargs", "callback", "noise_type", "noise_std"}
 # Arguments that RL Zoo itself passes to the constructor, and their flags.
@@ -133,7 +135,9 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     """
     algorithm = ALGOS[algo]
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))
-    kinds = [] if policy is None else [policy, *(kind for kind in policy.__mro__ if issubclass(kind, EqRPolicy))]
+    kinds = (
+        [] if policy is None else [kind for kind in policy.__mro__ if issubclass(kind, BasePolicy) and kind is not BasePolicy]
+    )
     own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
     legal = ENTRY_KEYS | set(inspect.signature(algorithm).parameters) - FLAGS.keys()
     for key in entry:
@@ -149,7 +153,7 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
             if key not in own:
                 advice = " Put it beside policy_kwargs." if key in ALGORITHM else nearest(key, own)
                 fail(f"{source}: {key!r} is not an argument of {algorithm.__name__}'s policy.{advice}")
-    if issubclass(algorithm, EqRAlgorithm):
+    if issubclass(algorithm, EqROffPolicy):
         check_wrappers(entry, algorithm.__name__, source)
 
 
@@ -175,7 +179,7 @@ def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:
                 getattr(importlib.import_module(module), kind)
             except (ImportError, AttributeError, ValueError) as error:
                 fail(f"{source}: {key} must name classes such as gymnasium.wrappers.TimeLimit, got {wrapper!r} ({error}).")
-    if "HistoryWrapper" in str(entry.get("env_wrapper")):
+    if name in DISCRETE_NAMES and "HistoryWrapper" in str(entry.get("env_wrapper")):
         fail(
             f"{source}: RL Zoo's HistoryWrapper needs continuous actions, but {name} supports discrete ones. "
             "Use frame_stack: 4 instead."

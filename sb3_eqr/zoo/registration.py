@@ -6,8 +6,14 @@ from typing import Any
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
-from sb3_eqr import AGENTS
+from sb3_eqr import AGENTS, CONTINUOUS, DISCRETE
 
+LATENT_SPACE: dict[str, list[Any]] = {
+    "prediction_depth": [1, 2, 3, 5],
+    "aet_coef": [0.1, 0.3, 1.0],
+    "reward_coef": [0.0, 0.3, 1.0],
+    "group": ["SE(2)", "SO(3)", "GL(2)", "none"],
+}
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 
 
@@ -68,6 +74,28 @@ def sample_eqr_params(
     return convert_eqr_params(sampled, kept)
 
 
+def sample_actor_critic_params(
+    trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any], *, stock: str, kept: dict[str, Any]
+) -> dict[str, Any]:
+    """Sample as RL Zoo does for the ``stock`` algorithm, and the latent model's group, depth and coefficients."""
+    found = HYPERPARAMS_SAMPLER[stock](trial, n_actions, n_envs, additional_args)
+    own = {name: trial.suggest_categorical(name, values) for name, values in LATENT_SPACE.items()}
+    return with_latent_params(found, own, kept)
+
+
+def convert_actor_critic_params(sampled: dict[str, Any], stock: str, kept: dict[str, Any]) -> dict[str, Any]:
+    """As :func:`convert_eqr_params`, by the names of :func:`sample_actor_critic_params`."""
+    own = {name: sampled[name] for name in LATENT_SPACE}
+    found = HYPERPARAMS_CONVERTER[stock]({name: value for name, value in sampled.items() if name not in own})
+    return with_latent_params(found, own, kept)
+
+
+def with_latent_params(stock: dict[str, Any], own: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
+    """Keyword arguments of the stock algorithm and of the latent model together."""
+    policy_kwargs = {**kept, **stock["policy_kwargs"], "group": own["group"]}
+    return {**stock, **{name: value for name, value in own.items() if name != "group"}, "policy_kwargs": policy_kwargs}
+
+
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     """
     Register the agents and their search spaces with RL Zoo.
@@ -76,10 +104,14 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     """
     ALGOS.update(AGENTS)  # type: ignore[arg-type]
     kept = policy_kwargs or {}
-    for name in AGENTS:
+    for name in DISCRETE:
         sampler = partial(sample_eqr_params, categorical=name == "eqr_rainbow", kept=kept)
         HYPERPARAMS_SAMPLER[name] = sampler  # type: ignore[assignment]
         HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
+    for name in CONTINUOUS:
+        stock = name.removeprefix("eqr_")
+        HYPERPARAMS_SAMPLER[name] = partial(sample_actor_critic_params, stock=stock, kept=kept)  # type: ignore[assignment]
+        HYPERPARAMS_CONVERTER[name] = partial(convert_actor_critic_params, stock=stock, kept=kept)  # type: ignore[assignment]
 
 
 def trust_files(algo: str) -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import EvalCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_eqr import AGENTS
-from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback
 from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.trust import check_zoo_folder, read_plain
@@ -76,7 +76,7 @@ class ResumableExperiment(ExperimentManager):
         except BaseException:
             self._remove_folder()
             raise
-        if found is not None and isinstance(found[0], EqRAlgorithm):
+        if found is not None and isinstance(found[0], EqROffPolicy):
             print(f"{in_one_line(found[0])}. The defaults of {type(found[0]).__name__} in Python may differ.")
         return found
 
@@ -136,7 +136,7 @@ class ResumableExperiment(ExperimentManager):
             super().learn(SimpleNamespace(learn=counting_on, env=model.env))  # type: ignore[arg-type]
 
 
-def in_one_line(model: EqRAlgorithm) -> str:
+def in_one_line(model: EqROffPolicy) -> str:
     """The agent's class, group and losses."""
     weights = {"AET": model.aet_coef, "GET": model.symmetry_coef, "reward": model.reward_coef} if model.depth else {}
     losses = ", ".join(f"{name} {weight:g}" for name, weight in weights.items() if weight)

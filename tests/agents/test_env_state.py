@@ -36,7 +36,8 @@ def timed(env):
     return wrappers.TimeAwareObservation(wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env)))
 
 
-IDS = ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "StarField-v0")
+MUJOCO = ("HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "Reacher-v5")
+IDS = ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "StarField-v0", *MUJOCO)
 WORLDS = {
     "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 4, seed)),
     "processes": lambda seed: VecNormalize(
@@ -49,6 +50,7 @@ WORLDS = {
     "pendulum": lambda seed: VecFrameStack(make_vec_env("PixelPendulum-v0", 2, seed), 4),
     "cliffwalk": lambda seed: make_vec_env("BlindCliffwalk-v0", 2, seed),
     **{f"minatar {game}": minatar(game) for game in GAMES},
+    "planar body": lambda seed: make_vec_env("PlanarBodyNoise-v0", 2, seed),
     "atari": atari,
 }
 
@@ -67,7 +69,10 @@ def play(env, actions):
 def test_original_and_restored_environment_behave_the_same(name):
     first, second = WORLDS[name](0), WORLDS[name](7)
     rng = np.random.default_rng(0)
-    actions = rng.integers(first.action_space.n, size=(90, first.num_envs))
+    if isinstance(first.action_space, gym.spaces.Box):
+        actions = rng.uniform(-1, 1, (90, first.num_envs, *first.action_space.shape)).astype(np.float32)
+    else:
+        actions = rng.integers(first.action_space.n, size=(90, first.num_envs))
     first.reset()
     second.reset()
     play(first, actions[:37])

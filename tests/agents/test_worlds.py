@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.utils.env_checker import check_env
+from scipy.linalg import expm
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_eqr import EqRQRDQN, envs
-from sb3_eqr.envs import PixelPendulum, SlidingBall, StarField
+from sb3_eqr.envs import PixelPendulum, PlanarBody, SlidingBall, StarField
 from sb3_eqr.envs.star_field import MOVE, NEAR, STAR_RADIUS, TURN, VIEW, orthonormalized, quaternion_rotation
 from tests.models import SMALL
 
@@ -415,8 +416,39 @@ def test_layouts():
     assert 0.03 < mean < 0.5  # neither empty nor full
 
 
-@pytest.mark.parametrize("env_id", [name for name in envs.WORLDS if name != "BlindCliffwalk-v0"])
+@pytest.mark.parametrize("env_id", [name for name in envs.WORLDS if not name.startswith(("BlindCliffwalk", "PlanarBody"))])
 def test_every_action_has_a_name(env_id):
     env = gym.make(env_id)
     names = env.unwrapped.get_action_meanings()
     assert len(names) == len(set(names)) == env.action_space.n
+
+
+def test_the_planar_body_moves_by_elements_of_SE2():
+    """Against the matrix exponential of the commanded velocity, multiplied from the right."""
+    env = PlanarBody(n_noise=3)
+    check_env(env)
+    rng = np.random.default_rng(0)
+    observation, info = env.reset(seed=1)
+
+    def pose(info):
+        c, s = np.cos(info["angle"]), np.sin(info["angle"])
+        return np.array([[c, -s, info["position"][0]], [s, c, info["position"][1]], [0, 0, 1]])
+
+    for step in range(30):
+        forward, turn = command = rng.uniform(-1, 1, 2) if step else np.array([1.0, 0.0])
+        velocity = np.array([[0, -0.5 * turn, 0.2 * forward], [0.5 * turn, 0, 0], [0, 0, 0]])
+        expected = pose(info) @ expm(velocity)
+        observation, reward, terminated, truncated, info = env.step(command)
+        np.testing.assert_allclose(pose(info), expected, atol=1e-12)
+        np.testing.assert_allclose(observation[:4], [*expected[:2, 2], expected[0, 0], expected[1, 0]], atol=1e-6)
+        assert reward == pytest.approx(-np.hypot(*expected[:2, 2])) and not (terminated or truncated)
+    _, info = env.reset(options={"position": (0.5, -0.25), "angle": 7.0})
+    assert info["angle"] == pytest.approx(7.0 - 2 * pi) and tuple(info["position"]) == (0.5, -0.25)
+
+
+def test_the_noise_of_the_planar_body_does_not_move_it():
+    quiet, noisy = gym.make("PlanarBody-v0"), gym.make("PlanarBodyNoise-v0")
+    for env in (quiet, noisy):
+        env.reset(seed=0, options={"position": (0.1, 0.2), "angle": 0.3})
+    one, many = (env.step(np.array([0.5, -1.0]))[0] for env in (quiet, noisy))
+    assert one.shape == (4,) and many.shape == (24,) and np.array_equal(one, many[:4]) and np.std(many[4:]) > 0.5

@@ -20,7 +20,7 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, cli, zoo
+from sb3_eqr import DISCRETE, EqRQRDQN, EqRRainbow, cli, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain
@@ -42,7 +42,7 @@ from tests.toys import ChainEnv, DictEnv, ImageEnv
         ("train --algo eqr_qrdqn --env Nope-v0", "gymnasium. Environments of another package need --gym-packages PACKAGE"),
         ("enjoy --algo eqr_qrdqn --env Nope-v0", "gymnasium. Environments of another package need --gym-packages PACKAGE"),
         ("record_video --algo eqr_qrdqn --env Nope-v0 --gym-packages nopackage", "'nopackage' cannot be imported"),
-        ("train --algo eqr_qrdqn --env Pendulum-v1 -n 50", r"action space.*use an algorithm .*PPO\)\.$"),
+        ("train --algo eqr_qrdqn --env Pendulum-v1 -n 50", r"action space.*use EqRSAC or EqRTQC\.$"),
         ("train --algo eqr_qrdqn --conf-file nofile", "--conf-file must be .* or one of .*eqr_bbf.*, got 'nofile'"),
         ("train --algo eqr_qrdqn --conf-file no.yml", "there is no file 'no.yml'"),
         ("train --algo eqr_rainbow --conf-file stock/qrdqn", "'n_quantiles' is not an argument of EqRRainbow's policy"),
@@ -313,12 +313,13 @@ def test_the_search_space_makes_agents(name):
     groups = set()
     for _ in range(8):
         trial = study.ask()
-        sampled = HYPERPARAMS_SAMPLER[name](trial, 2, 1, {})
+        sampled = HYPERPARAMS_SAMPLER[name](trial, 2, 1, {"using_her_replay_buffer": False})
         assert HYPERPARAMS_CONVERTER[name](trial.params) == sampled and sampled["policy_kwargs"]["log_std"] == 1
         del sampled["policy_kwargs"]["log_std"]
-        model = ALGOS[name]("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu", **sampled)
+        env = "CartPole-v1" if name in DISCRETE else "Pendulum-v1"
+        model = ALGOS[name]("MlpPolicy", env, buffer_size=100, device="cpu", **sampled)
         groups.add(str(model.policy.options.group))
-        assert model.gradient_steps >= 1 and (name == "eqr_qrdqn") != ("v_max" in sampled["policy_kwargs"])
+        assert model.gradient_steps >= 1 and (name == "eqr_rainbow") == ("v_max" in sampled["policy_kwargs"])
     assert len(groups) > 1
 
 

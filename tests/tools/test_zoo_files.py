@@ -10,6 +10,7 @@ from rl_zoo3.utils import ALGOS
 
 from sb3_eqr import zoo
 from sb3_eqr.configurations import configuration_files
+from sb3_eqr.zoo.entries import check_entry
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 ENVIRONMENTS = {
@@ -22,6 +23,8 @@ ENVIRONMENTS = {
     "SlidingBallDistractors-v0",
 }
 ENVIRONMENTS |= {f"MinAtar/{game}-v1" for game in GAMES}
+MUJOCO = {f"{task}-v5" for task in ("HalfCheetah", "Ant", "Hopper", "Walker2d", "Humanoid", "Reacher")}
+CONTINUOUS = {*MUJOCO, "Pendulum-v1", "LunarLanderContinuous-v3"}
 ENTRIES = {name: yaml.safe_load(path.read_text(encoding="utf-8")) for name, path in configuration_files().items()}
 GENERIC = {"default", "default-image", "default-small-image", "default-dict"}  # test_zoo.py trains by them
 CASES = [  # an entry shared by several environments is one YAML object and built once
@@ -50,18 +53,24 @@ class Manager(ExperimentManager):
 def algorithm_of(name):
     if name.startswith("stock/"):
         return name.removeprefix("stock/")
+    if name in ("eqr_sac", "eqr_tqc"):
+        return name
     return "eqr_qrdqn" if name in ("eqr_qrdqn", "qrdqn") else "eqr_rainbow"
 
 
 def test_every_file_has_the_expected_environments():
-    own, stock = {"eqr_qrdqn", "eqr_rainbow"}, {"stock/dqn", "stock/qrdqn"}
+    own, stock, continuous = {"eqr_qrdqn", "eqr_rainbow"}, {"stock/dqn", "stock/qrdqn"}, {"eqr_sac", "eqr_tqc"}
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS | GENERIC} == own
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS} == stock
+    generic = GENERIC - {"default-small-image"}
+    assert all(ENTRIES[name].keys() == CONTINUOUS | generic for name in continuous)
     minatar = {"atari", *(env_id for env_id in ENVIRONMENTS if env_id.startswith("MinAtar/"))}
     rivals = {"qrdqn", "rainbow", "spr"}
     for name in rivals:
         assert ENTRIES[name].keys() == minatar and len({id(ENTRIES[name][env_id]) for env_id in minatar}) == 2
-    assert all(entries.keys() == {"atari"} for name, entries in ENTRIES.items() if name not in own | stock | rivals)
+    assert all(
+        entries.keys() == {"atari"} for name, entries in ENTRIES.items() if name not in own | stock | continuous | rivals
+    )
 
 
 @pytest.mark.parametrize("name, entry", CASES, ids=lambda value: value)
@@ -87,3 +96,14 @@ def test_every_entry_builds_its_agent(name, entry, tmp_path):
     model.batch_size, model.gradient_steps = 4, 1
     model.learn(24)
     assert model._n_updates == 1
+
+
+@pytest.mark.parametrize(
+    "algo, key", [("eqr_sac", "log_std_init"), ("eqr_tqc", "n_quantiles"), ("eqr_rainbow", "net_arch"), ("sac", "n_critics")]
+)
+def test_an_entry_may_have_the_arguments_of_the_policy_of_sb3(algo, key, capsys):
+    zoo.register()
+    check_entry({"policy": "MlpPolicy", "policy_kwargs": {key: 1}}, algo, "file")
+    with pytest.raises(SystemExit):
+        check_entry({"policy": "MlpPolicy", "policy_kwargs": {f"{key}s": 1}}, algo, "file")
+    assert f"Did you mean '{key}'?" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -153,6 +154,19 @@ def warn_of_unknown(classes: list[str]) -> None:
     )
 
 
+def warn_of_noise(model: BaseAlgorithm) -> None:
+    """Warn, at the start of a run, that the noise of its actions is drawn anew when it is resumed."""
+    noise = getattr(model, "action_noise", None)
+    kept = NormalActionNoise, type(None)  # has no state
+    names = ["use_sde=True"] if model.use_sde else []
+    names += [type(noise).__name__] if not isinstance(getattr(noise, "base_noise", noise), kept) else []
+    if names:
+        warnings.warn(
+            f"{' and '.join(names)}: SB3 draws this noise anew when training resumes, so it does not continue bit for bit. "
+            "Use NormalActionNoise, or none."
+        )
+
+
 def restore_run(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) -> None:
     """
     Restore the state of the environments and of the random generators. If that of the environments is not known completely,
@@ -217,6 +231,7 @@ class ExactCheckpointCallback(BaseCallback):
         assert env is not None
         if unknown := capture(env)[1]:
             warn_of_unknown(unknown)
+        warn_of_noise(self.model)
         old = find_checkpoints(self.save_path)
         manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)

@@ -48,6 +48,17 @@ gymnasium.envs.classic_control.pendulum.PendulumEnv state:array? last_u:array/re
 gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv s:int lastaction:int?
 gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv s:int lastaction:int?
 gymnasium.envs.toy_text.taxi.TaxiEnv s:int lastaction:int? fickle_step:bool
+gymnasium.envs.mujoco.half_cheetah_v5.HalfCheetahEnv data:part
+gymnasium.envs.mujoco.hopper_v5.HopperEnv data:part
+gymnasium.envs.mujoco.walker2d_v5.Walker2dEnv data:part
+gymnasium.envs.mujoco.ant_v5.AntEnv data:part
+gymnasium.envs.mujoco.humanoid_v5.HumanoidEnv data:part
+gymnasium.envs.mujoco.humanoidstandup_v5.HumanoidStandupEnv data:part
+gymnasium.envs.mujoco.swimmer_v5.SwimmerEnv data:part
+gymnasium.envs.mujoco.reacher_v5.ReacherEnv data:part goal:array
+gymnasium.envs.mujoco.pusher_v5.PusherEnv data:part
+gymnasium.envs.mujoco.inverted_pendulum_v5.InvertedPendulumEnv data:part
+gymnasium.envs.mujoco.inverted_double_pendulum_v5.InvertedDoublePendulumEnv data:part
 ale_py.env.AtariEnv ale:part
 minatar.gym.BaseEnv game:part
 minatar.environment.Environment random:part env:part last_action:int
@@ -65,6 +76,7 @@ sb3_eqr.envs.atari.Atari100kWrapper
 sb3_eqr.envs.minatar.ChannelsFirstImage
 sb3_eqr.envs.blind_cliffwalk.BlindCliffwalk state:int
 sb3_eqr.envs.sliding_ball.SlidingBall _start:array _moved:array _distractors:array
+sb3_eqr.envs.planar_body.PlanarBody position:array angle:real
 sb3_eqr.envs.pixel_pendulum.PixelPendulum angle:real velocity:real
 sb3_eqr.envs.star_field.StarField rotation:array translation:array
 """
@@ -194,6 +206,20 @@ def _is_emulator(part: Any) -> bool:
     return type(part).__module__.startswith("ale_py") and type(part).__name__ == "ALEInterface"
 
 
+def _is_simulation(part: Any) -> bool:
+    return type(part).__module__.startswith("mujoco") and type(part).__name__ == "MjData"
+
+
+def _arrays_of(simulation: Any) -> dict[str, np.ndarray]:
+    """
+    All arrays of a MuJoCo simulation with a constant size, also those that follow from others: an observation may hold what
+    the last step computed on its way. Those of contacts, which a new simulation has not, are computed anew by each step.
+    """
+    new = type(simulation)(simulation.model)
+    names = [name for name in dir(new) if not name.startswith("_") and isinstance(getattr(new, name), np.ndarray)]
+    return {name: getattr(simulation, name) for name in names if getattr(new, name).size}
+
+
 def _state_of(part: Any) -> Any:
     """The state of a wrapper, an environment or a part of it as JSON; ``None`` if it is not known."""
     if isinstance(part, np.random.Generator):
@@ -202,6 +228,8 @@ def _state_of(part: Any) -> Any:
         return encode(part.get_state(legacy=False))
     if _is_emulator(part):
         return part.cloneSystemState().serialize().hex()
+    if _is_simulation(part):
+        return {"time": part.time, **{name: encode(value) for name, value in _arrays_of(part).items()}}
     if isinstance(part, dict):
         return {key: _state_of(item) for key, item in part.items()}
     if (row := _row(part)) is not None:
@@ -227,21 +255,30 @@ def _restore(part: Any, state: Any) -> None:
         part.set_state(found)
     elif _is_emulator(part):
         part.restoreSystemState(type(part.cloneSystemState())(bytes.fromhex(state)))
+    elif _is_simulation(part):
+        _restore_simulation(part, state)
     elif isinstance(part, dict):
         for key in part:
             _restore(part[key], state[key])
     elif (row := _row(part)) is None:
-        if state["np_random"] is not None:
-            _restore(part.np_random, state["np_random"])
-        _load_own(part, decode(state["state"]))
+        _load_own(part, state)
     else:
         _restore_attributes(part, state, row)
 
 
+def _restore_simulation(part: Any, state: Any) -> None:
+    part.time = _checked("MjData.time", state["time"], "real", part.time)
+    for name, array in _arrays_of(part).items():
+        array[...] = _checked(f"MjData.{name}", decode(state[name]), "array", array)
+
+
 def _load_own(part: Any, state: Any) -> None:
     """The ``load_state_dict`` of a user's class, whose mistakes are not the checkpoint's."""
+    if state["np_random"] is not None:
+        _restore(part.np_random, state["np_random"])
+    found = decode(state["state"])
     try:
-        part.load_state_dict(state)
+        part.load_state_dict(found)
     except Exception as error:
         raise ValueError(f"{_name(part)}.load_state_dict must load what its state_dict returned, got {error!r}.") from error
 
@@ -257,11 +294,12 @@ def _restore_attributes(part: Any, state: dict[str, Any], row: dict[str, str]) -
 
 
 def _checked(path: str, value: Any, kinds: str, current: Any) -> Any:
-    """A decoded value of a declared type; an array has the shape and dtype of the current one."""
+    """A decoded value of a declared type; an array has shape and dtype of the current one, floats in any precision."""
     legal = [kind for name in kinds.removesuffix("?").split("/") for kind in TYPES[name]] + [type(None)] * kinds.endswith("?")
     is_legal = isinstance(value, tuple(legal))
     if isinstance(value, np.ndarray) and isinstance(current, np.ndarray):
-        is_legal &= (value.shape, value.dtype) == (current.shape, current.dtype)
+        floats = all(np.issubdtype(array.dtype, np.floating) for array in (value, current))
+        is_legal &= value.shape == current.shape and (floats or value.dtype == current.dtype)
     if not is_legal:
         raise ValueError(f"{path} must be like the current {type(current).__name__}, got {value!r:.80}.")
     return value

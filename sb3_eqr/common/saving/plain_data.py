@@ -29,6 +29,7 @@ CLASSES = (nn.Module, th.optim.Optimizer, ReplayBuffer, BasePolicy)  # base clas
 # Classes whose objects consist only of their attributes.
 OBJECTS = {
     "stable_baselines3.common.utils": ("FloatSchedule", "LinearSchedule", "ConstantSchedule"),
+    "stable_baselines3.common.noise": ("NormalActionNoise", "OrnsteinUhlenbeckActionNoise", "VectorizedActionNoise"),
     "stable_baselines3.common.type_aliases": ("TrainFreq", "TrainFrequencyUnit"),
     "rl_zoo3.utils": ("SimpleLinearSchedule",),
     "sb3_eqr.common.resets": ("ResetSchedule", "Resets"),
@@ -57,6 +58,8 @@ def encode(value: Any) -> Any:
         return {KIND: array, "dtype": value.dtype.str, "shape": list(value.shape), "data": data}
     if kind.__name__ in SPACES and kind is getattr(spaces, kind.__name__):
         return _encode_space(value)
+    if isinstance(value, type) and issubclass(value, np.number):
+        return {KIND: "numpy type", "dtype": np.dtype(value).str}
     if isinstance(value, (type, FunctionType)):
         kind = value
         if _is_legal(value):
@@ -190,6 +193,7 @@ DECODERS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "array": _decode_array,
     "scalar": _decode_array,
     "dtype": _decode_dtype,
+    "numpy type": lambda parts: np.dtype(str(parts["dtype"])).type,
     "device": lambda parts: th.device(parts["name"]),
     "tensor": lambda parts: th.from_numpy(np.ascontiguousarray(parts["array"])),
     "space": _decode_space,

@@ -1,0 +1,196 @@
+"""The algorithm of actor-critic agents with a latent model: before each update of SB3's, the latent model makes one."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
+from sb3_eqr.common.checks import validation
+from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments, integer
+from sb3_eqr.common.checks.update_monitor import UpdateMonitor
+from sb3_eqr.common.networks.optimizers import assign_gradients
+from sb3_eqr.common.objective import LatentObjective
+from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
+from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
+
+RULES = {**ALGORITHM, "learning_starts": integer(0), "target_update_interval": integer(1)}
+SCALE_INTERVAL = 1_000  # updates between two estimates of the rewards' spread, each of which takes all rewards
+MIN_REWARDS = 100  # for an estimate
+MIN_SPREAD = 1e-4  # as a share of the largest reward; below, it may be rounding
+
+
+class EqRActorCritic(EqROffPolicy):
+    """
+    Mixin, listed before an actor-critic algorithm of SB3, whose ``train`` samples once before each gradient step. There, the
+    latent model makes an update of its own, with windows and an optimiser of its own; then the algorithm makes its own update,
+    unchanged, with networks that read the moving average of the latent model.
+    """
+
+    policy: EqRActorCriticPolicy
+    reward_scale = 1.0  # the standard deviation of the rewards in the replay buffer; saved with the model
+
+    def __init__(
+        self,
+        policy: str | type[EqRActorCriticPolicy],
+        env: Any,
+        *,
+        prediction_depth: int,
+        aet_coef: float,
+        symmetry_coef: float,
+        reward_coef: float,
+        policy_kwargs: dict[str, Any] | None,
+        _init_setup_model: bool,
+        **kwargs: Any,
+    ):
+        check_arguments({**kwargs, **locals()}, RULES)
+        validation.check_device(kwargs["device"])
+        validation.warn_of_memory_option(kwargs.pop("optimize_memory_usage"))
+        policy_kwargs = dict(policy_kwargs or {})  # a copy, because SB3 changes it
+        super().__init__(policy, env, policy_kwargs=policy_kwargs, **kwargs, _init_setup_model=False)  # type: ignore[call-arg]
+        self.prediction_depth = prediction_depth
+        self.aet_coef = aet_coef
+        self.symmetry_coef = symmetry_coef
+        self.reward_coef = reward_coef
+        self.policy_description: dict[str, str] = {}  # saved with the model
+        if _init_setup_model:
+            self._setup_model()
+
+    @property
+    def loss_coefs(self) -> dict[str, float]:
+        """The weight λ of each auxiliary loss by its name."""
+        return {"aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
+
+    @classmethod
+    def _check_action_space(cls, action_space: spaces.Space) -> None:
+        validation.check_continuous_actions(action_space)
+
+    def _check_arguments(self) -> None:
+        check_arguments(vars(self), RULES)
+        name, given = type(self).__name__, self.replay_buffer_kwargs
+        validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
+        validation.check_normalization(self._vec_normalize_env, self.observation_space)
+        validation.check_replay(name, self.replay_buffer_class, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
+        if issubclass(self.replay_buffer_class or SequenceReplayBuffer, PrioritizedSequenceReplayBuffer):
+            raise ValueError(f"replay_buffer_class must sample uniformly, because {name} computes no priorities.")
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        check_arguments(vars(self), RULES)  # attributes may have been changed
+        self._check_losses()
+        result = super()._setup_learn(*args, **kwargs)
+        validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)
+        return result
+
+    def _check_losses(self) -> None:
+        validation.check_losses(1.0, self.depth, self.batch_size, self.gamma, None)
+        self.policy.check_losses(self.depth, self.symmetry_coef)
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.env is not None:
+            self.frame_stack = self._find_frame_stack()
+        self.replay_buffer_class = self.replay_buffer_class or SequenceReplayBuffer
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        n_steps, self.n_steps = self.n_steps, 1  # of SB3's own buffers
+        super()._setup_model()
+        self.n_steps = n_steps
+        saved, self.policy_description = self.policy_description, self.policy.description
+        validation.check_same_parameters(self.policy_description, saved)
+        self._check_losses()
+        self._monitor = UpdateMonitor(self.policy)
+        if self.policy.has_latent:
+            policy = self.policy
+            self.objective = LatentObjective(policy, policy.encoder, policy.latent_encoder, policy.augment)
+            self._trained = [p for group in policy.latent_optimizer.param_groups for p in group["params"]]
+
+    def _make_replay_buffer(self) -> SequenceReplayBuffer:
+        return self._new_replay_buffer(self.replay_buffer_class or SequenceReplayBuffer, self.n_steps)
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        parts = [self.actor, self.critic]  # type: ignore[attr-defined]
+        return [part.optimizer for part in parts] + ([self.policy.latent_optimizer] if self.policy.has_latent else [])
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        Make a round of updates.
+
+        :param gradient_steps: number of updates
+        :param batch_size: B
+        """
+        buffer, policy = self.replay_buffer, self.policy
+        assert buffer is not None
+        buffer.n_steps, buffer.gamma, buffer.prediction_depth = self.n_steps, self.gamma, self.depth  # may have been changed
+        if self.depth > 0:
+            self._log_last_round()
+            self._monitor.start_round(self._n_updates)
+            if not buffer.can_sample():
+                return
+            self._find_reward_scale(buffer, gradient_steps)
+            policy.set_training_mode(True)
+            rate = self.lr_schedule(max(self._current_progress_remaining, 0.0))  # below 0 in a rollout beyond the last step
+            update_learning_rate(policy.latent_optimizer, rate)
+            self.replay_buffer = BeforeSamples(buffer, self._update_latent_model)  # type: ignore[assignment]
+        try:
+            super().train(gradient_steps, batch_size)  # type: ignore[misc]
+        finally:
+            self.replay_buffer = buffer
+            if policy.has_latent:
+                policy.reader.forget()
+
+    def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:
+        """One update of encoder and latent model, and of their moving averages."""
+        policy, objective = self.policy, self.objective
+        assert samples.rollout_rewards is not None
+        samples = samples._replace(rollout_rewards=samples.rollout_rewards / self.reward_scale)
+        observations = objective.augment(samples.observations)
+        features = policy.encoder(observations)
+        names = [name for name, coef in self.loss_coefs.items() if coef > 0]
+        losses = objective.latent_losses(names, samples, observations, features)
+        means = {name: loss.mean() for name, loss in losses.items()}
+        assign_gradients(sum(self.loss_coefs[name] * mean for name, mean in means.items()), self._trained)  # type: ignore[arg-type]
+        policy.latent_optimizer.step()
+        policy.target_copy.update(policy.options.latent_tau)  # type: ignore[arg-type]
+        policy.reader.forget()
+        self._monitor.add({f"{name}_loss": mean.detach() for name, mean in means.items()})
+
+    def _find_reward_scale(self, buffer: SequenceReplayBuffer, gradient_steps: int) -> None:
+        """Estimate the standard deviation of the rewards again, if it is due; 1 if VecNormalize scales them."""
+        rewards = buffer.rewards[: buffer.size()]
+        is_due = -self._n_updates % SCALE_INTERVAL < gradient_steps or rewards.size < SCALE_INTERVAL
+        normalize = self._vec_normalize_env
+        if normalize is not None and normalize.norm_reward:
+            self.reward_scale = 1.0
+        elif is_due and rewards.size >= MIN_REWARDS:
+            self.reward_scale = spread_of(rewards)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_monitor", "objective", "_trained"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "policy.latent_optimizer"] if self.policy.has_latent else names, variables
+
+
+def spread_of(rewards: np.ndarray) -> float:
+    """The standard deviation of rewards; 1 if all are nearly equal."""
+    spread = float(rewards.std(dtype=np.float64))
+    return spread if spread > MIN_SPREAD * np.abs(rewards).max() else 1.0
+
+
+class BeforeSamples:
+    """A replay buffer for one round of updates; each call of ``sample`` first passes windows of its own to a function."""
+
+    def __init__(self, buffer: SequenceReplayBuffer, function: Callable[[SequenceReplayBufferSamples], None]):
+        self._buffer = buffer
+        self._function = function
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
+        """As that of the buffer."""
+        self._function(self._buffer.sample(batch_size, env))
+        return self._buffer.sample(batch_size, env)

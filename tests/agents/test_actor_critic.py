@@ -1,0 +1,390 @@
+"""EqRSAC and EqRTQC: SAC and TQC, unchanged, beside a latent model that is trained apart."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+from sb3_eqr import ExactCheckpointCallback, PrioritizedSequenceReplayBuffer
+from sb3_eqr.eqr_sac import EqRSAC
+from sb3_eqr.eqr_tqc import EqRTQC
+from tests.models import same, tensors
+
+SMALL = {"learning_starts": 30, "buffer_size": 500, "batch_size": 8, "device": "cpu", "seed": 0}
+NETWORK = {"net_arch": [16], "latent_hidden_dim": 16, "n_blocks": 3}
+NET = {"net_arch": [16]}
+OFF = {"prediction_depth": 0, "policy_kwargs": {"head_input": "observation", **NET}}
+PAIRS = pytest.mark.parametrize("agent, stock", [(EqRSAC, SAC), (EqRTQC, TQC)], ids=["EqRSAC", "EqRTQC"])
+EACH = pytest.mark.parametrize("agent", [EqRSAC, EqRTQC])
+BOX = spaces.Box(-1, 1, (3,))
+
+
+class MoveEnv(gym.Env):
+    """A point moves by the action; the last of the three numbers is noise. Episodes end outside, or after 20 steps."""
+
+    action_space = spaces.Box(-2, 2, (2,))
+
+    def __init__(self, observation_space=BOX):
+        self.observation_space = observation_space
+
+    def observe(self):
+        self.place = np.append(self.place[:2], self.np_random.uniform(-1, 1)).astype(np.float32)
+        if self.observation_space == BOX:
+            return self.place
+        image = self.np_random.integers(0, 256, (3, 40, 40), dtype=np.uint8)
+        return {"image": image, "place": self.place} if isinstance(self.observation_space, spaces.Dict) else image
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.time = self.np_random.uniform(-0.5, 0.5, 3), 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.place = self.place + 0.2 * np.append(action, 0.0)
+        self.time += 1
+        is_outside = bool(np.abs(self.place[:2]).max() > 1)
+        self.place = np.clip(self.place, -1, 1)
+        return self.observe(), float(self.place[0]), is_outside, self.time >= 20, {}
+
+
+IMAGE = spaces.Box(0, 255, (3, 40, 40), np.uint8)
+DICT = spaces.Dict({"image": IMAGE, "place": BOX})
+
+
+def make(agent, env=None, policy="MlpPolicy", **kwargs):
+    policy_kwargs = {**NETWORK, **kwargs.pop("policy_kwargs", {})}
+    return agent(policy, MoveEnv() if env is None else env, **{**SMALL, **kwargs}, policy_kwargs=policy_kwargs)
+
+
+@PAIRS
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"n_steps": 3, "train_freq": 4, "gradient_steps": 3, "target_update_interval": 2},
+        {"train_freq": (1, "episode"), "gradient_steps": -1, "ent_coef": 0.1},
+        {"use_sde": True, "learning_rate": lambda remaining: 1e-3 * remaining},
+    ],
+    ids=["default", "n steps", "episodes", "sde"],
+)
+def test_without_latent_model_all_parameters_are_those_of_the_stock_agent(agent, stock, kwargs):
+    ours = agent("MlpPolicy", MoveEnv(), **SMALL, **kwargs, **OFF).learn(90)
+    theirs = stock("MlpPolicy", MoveEnv(), **SMALL, **kwargs, policy_kwargs={"net_arch": [16]}).learn(90)
+    assert ours._n_updates == theirs._n_updates > 0
+    assert same(ours, theirs)
+
+
+@PAIRS
+def test_without_latent_model_images_and_normalised_environments_too(agent, stock):
+    for policy, make_env in [
+        ("CnnPolicy", lambda: MoveEnv(IMAGE)),
+        ("MultiInputPolicy", lambda: MoveEnv(DICT)),
+        ("MlpPolicy", lambda: VecNormalize(make_vec_env(MoveEnv, 2, seed=0))),
+    ]:
+        ours = agent(policy, make_env(), **SMALL, **OFF).learn(34)
+        assert same(ours, stock(policy, make_env(), **SMALL, policy_kwargs={"net_arch": [16]}).learn(34)), policy
+
+
+@EACH
+def test_actor_and_critics_read_the_moving_average(agent):
+    model = make(agent).learn(60)
+    policy, observation = model.policy, th.rand(5, 3)
+    policy.set_training_mode(False)
+    features = policy.latent_encoder(observation)
+    state = policy.latent_target.embedding(features)  # (5, 18)
+    read = policy.actor.extract_features(observation, policy.actor.features_extractor)
+    assert th.equal(read, th.cat([observation, features, state], dim=1)) and not read.requires_grad
+    action = th.rand(5, 2)
+    element = policy.latent_target.group.element(
+        policy.latent_target.transition(th.cat([state, action], dim=1)).view(5, 3, 3)
+    )  # SE(2): rotation beside translation, (5, 3, 2, 3)
+    state = state.view(5, 3, 2, 3)
+    moved = element[..., :2] @ state
+    moved[..., 2] += element[..., 2]
+    moved = moved.flatten(1)
+    inputs = th.cat([read, action, moved], dim=1)
+    expected = [network(inputs) for network in policy.critic.q_networks]
+    found = policy.critic(observation, action)
+    found = found if agent is EqRSAC else found.unbind(1)
+    assert all(th.allclose(*pair, atol=1e-6) for pair in zip(found, expected, strict=True))
+
+
+@EACH
+def test_the_gradient_for_the_action_passes_the_latent_model(agent):
+    """Against central differences in float64."""
+    model = make(agent).learn(60)
+    policy = model.policy.double()
+    critic, observation, action = policy.critic, th.rand(4, 3, dtype=th.float64), th.rand(4, 2, dtype=th.float64)
+    features = policy.latent_encoder(observation)
+    read = th.cat([observation, features, policy.latent_target.embedding(features)], dim=1)
+    critic.features_extractor.forward = lambda obs: read  # as SB3 converts observations to float32
+    action.requires_grad_()
+
+    def value(action):
+        found = critic(observation, action)
+        return (found[0] if agent is EqRSAC else found).sum()
+
+    (found,) = th.autograd.grad(value(action), action)
+    expected = th.zeros_like(found)
+    for index in np.ndindex(4, 2):
+        step = th.zeros_like(found)
+        step[index] = 1e-5
+        expected[index] = (value(action + step) - value(action - step)) / 2e-5
+    assert th.allclose(found, expected, atol=1e-8)
+    with_constant = th.cat([read, action, critic.features_extractor.moved(observation, action).detach()], dim=1)
+    direct = sum(network(with_constant).sum() for network in (critic.q_networks[:1] if agent is EqRSAC else critic.q_networks))
+    assert (th.autograd.grad(direct, action)[0] - found).abs().max() > 1e-6
+
+
+@EACH
+def test_the_pass_for_the_actor_computes_no_gradient_of_the_critics(agent):
+    """SAC discards it. The gradient for the actions is the same."""
+    policy, action = make(agent).learn(60).policy, th.rand(4, 2, requires_grad=True)
+    observation = th.rand(4, 3)
+    policy.critic.zero_grad()
+
+    def values(action):
+        found = policy.critic(observation, action)
+        return th.cat(found, dim=1) if agent is EqRSAC else found
+
+    values(action).sum().backward()
+    assert all(parameter.grad is None or not parameter.grad.any() for parameter in policy.critic.parameters())
+    values(action.detach()).sum().backward()
+    assert all(parameter.grad.any() for parameter in policy.critic.parameters())
+
+
+@EACH
+def test_only_the_auxiliary_losses_train_the_latent_model(agent, monkeypatch):
+    monkeypatch.setattr(agent, "_update_latent_model", lambda self, samples: self.policy.reader.forget())
+    model, untrained = make(agent).learn(60), make(agent)
+    for part in ("encoder", "latent_encoder", "latent_model", "latent_target"):
+        assert same(getattr(model.policy, part), getattr(untrained.policy, part)), part
+        assert all(parameter.grad is None for parameter in getattr(model.policy, part).parameters()), part
+    assert model._n_updates == 30 and not same(model.policy.actor, untrained.policy.actor)
+
+
+@EACH
+def test_actor_and_critics_see_one_augmentation_of_each_batch(agent):
+    model = make(agent, MoveEnv(IMAGE), "CnnPolicy", train_freq=3, gradient_steps=3).learn(33)
+    policy, encoded = model.policy, []
+    policy.latent_encoder.register_forward_hook(lambda module, inputs, output: encoded.append(inputs[0]))
+    model.train(3, 8)
+    assert len(encoded) == 3 * 3  # the rollout, s and s' of each update
+    assert all(len({batch.sum().item() for batch in encoded[i : i + 3]}) == 3 for i in (0, 3, 6))
+    assert policy.reader._known == []
+    for kwargs in ({}, {"prediction_depth": 0}):
+        assert make(agent, **kwargs).learn(60).policy.reader._known == []
+
+
+@EACH
+def test_rewards_are_divided_by_their_spread(agent):
+    model = make(agent, learning_starts=100, n_steps=2).learn(130)
+    assert model.reward_scale == pytest.approx(model.replay_buffer.rewards[:130].std(), rel=0.1)
+
+    def after(env, n):
+        return make(agent, env, learning_starts=0).learn(n).reward_scale
+
+    assert after(MoveEnv(), 90) == 1.0  # too few
+    assert after(VecNormalize(make_vec_env(MoveEnv, 1)), 130) == 1.0
+    assert after(VecNormalize(make_vec_env(MoveEnv, 1), norm_reward=False), 130) not in (0.0, 1.0)
+    constant = gym.wrappers.TransformReward(MoveEnv(), lambda reward: -0.1)
+    assert after(constant, 130) == 1.0  # in float32 their standard deviation is not quite 0
+
+
+@EACH
+def test_a_round_of_updates_that_passes_an_interval_estimates_the_spread(agent):
+    model = make(agent, buffer_size=2_000, learning_starts=1_100).learn(1_100)
+    model._n_updates, model.reward_scale = 995, 5.0
+    model.train(3, 8)
+    assert model.reward_scale == 5.0
+    model.train(5, 8)  # update 1,000 is the third of these
+    assert model.reward_scale == pytest.approx(model.replay_buffer.rewards[:1_100].std(), rel=1e-5)
+
+
+@PAIRS
+def test_attributes_that_change_between_calls_of_learn_hold_for_replay(agent, stock):
+    def twice(kind, **kwargs):
+        model = kind("MlpPolicy", MoveEnv(), **SMALL, **kwargs).learn(60)
+        model.gamma = 0.5
+        return model.learn(60)
+
+    assert same(twice(agent, **OFF), twice(stock, policy_kwargs=NET))
+    model = make(agent).learn(60)
+    model.prediction_depth, model.n_steps, model.gamma = 4, 3, 0.5
+    buffer = model.learn(60).replay_buffer
+    assert (buffer.prediction_depth, buffer.n_steps, buffer.gamma) == (4, 3, 0.5)
+
+
+@EACH
+def test_the_learning_rate_of_the_latent_model_follows_the_schedule(agent):
+    env = make_vec_env(MoveEnv, 8, seed=0)  # 104 steps of 100 make the schedule negative
+    optimizer = make(agent, env, learning_rate=lambda remaining: 1e-3 * remaining).learn(100).policy.latent_optimizer
+    assert optimizer.param_groups[0]["lr"] == 0.0
+
+
+@EACH
+def test_one_update_by_hand(agent):
+    """Losses by their definitions, Adam's first step, and the moving average, for windows that do not reach an end."""
+    model = make(agent, learning_starts=100, learning_rate=1e-3).learn(100)
+    policy, before = model.policy, tensors(model)
+    np.random.seed(5)
+    samples = model.replay_buffer.sample(8)
+    scale = model.replay_buffer.rewards[:100].std()
+    policy.set_training_mode(True)
+    latent, target = policy.latent_model, policy.latent_target
+    states = [latent.embedding(policy.encoder(samples.observations))]
+    aet, reward = 0.0, 0.0
+    for m in range(2):
+        element = latent.action_element(states[-1], samples.rollout_actions[:, m] * samples.mask[:, m, None])
+        states.append(latent.act(element, states[-1]))
+        wanted = target.projection(target.embedding(policy.latent_encoder(samples.rollout_observations[:, m])))
+        found = latent.predictor(latent.projection(states[-1]))
+        distance = (found / found.norm(dim=1, keepdim=True) - wanted / wanted.norm(dim=1, keepdim=True)).square().sum(dim=1)
+        error = (latent.reward_net(states[-1])[:, 0] - samples.rollout_rewards[:, m] / scale).square()
+        aet, reward = aet + samples.mask[:, m] * distance, reward + samples.mask[:, m] * error
+    loss = ((aet + reward) / samples.mask.sum(dim=1)).mean()
+    parameters = {f"encoder.{name}": p for name, p in policy.encoder.named_parameters()}
+    parameters |= {f"latent_model.{name}": p for name, p in latent.named_parameters()}
+    gradients = th.autograd.grad(loss, list(parameters.values()), allow_unused=True)
+    np.random.seed(5)
+    model.train(1, 8)
+    after, averages = tensors(model), {"encoder": "latent_encoder", "latent_model": "latent_target"}
+    for name, gradient in zip(parameters, gradients, strict=True):
+        if gradient is None:
+            assert th.equal(after[name], before[name])
+            continue
+        expected = before[name] - 1e-3 * gradient / (gradient.abs() + 1e-8)
+        large = gradient.abs() > 1e-5
+        assert th.allclose(after[name][large], expected[large], atol=1e-6), name
+        part, _, rest = name.partition(".")
+        average = f"{averages[part]}.{rest}"
+        assert th.allclose(after[average], 0.995 * before[average] + 0.005 * after[name], atol=1e-7), name
+
+
+@EACH
+@pytest.mark.parametrize(
+    "policy, make_env, kwargs",
+    [
+        ("MlpPolicy", lambda: VecNormalize(make_vec_env(MoveEnv, 2, seed=0)), {"n_steps": 3}),
+        ("MlpPolicy", MoveEnv, {"action_noise": NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)), "ent_coef": "auto_0.1"}),
+        ("MlpPolicy", MoveEnv, {"use_sde": True, "train_freq": (1, "episode"), "gradient_steps": -1}),
+        ("MlpPolicy", MoveEnv, {"symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(3)"}}),
+        ("MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "none", "n_blocks": None}}),
+        ("CnnPolicy", lambda: VecFrameStack(make_vec_env(lambda: MoveEnv(IMAGE), 2), 4), {}),
+        ("MultiInputPolicy", lambda: MoveEnv(DICT), {}),
+    ],
+    ids=["normalised", "noise", "sde", "GET", "no group", "images", "dicts"],
+)
+def test_a_run_is_repeatable_and_can_be_saved(agent, policy, make_env, kwargs, tmp_path):
+    first, second = (make(agent, make_env(), policy, **kwargs).learn(60) for _ in range(2))
+    assert first._n_updates > 10 and same(first, second)
+    assert all(th.isfinite(value).all() for value in tensors(first).values())
+    first.save(tmp_path / "model")
+    loaded = agent.load(tmp_path / "model")
+    observation = first.observation_space.sample()
+    assert same(first, loaded) and loaded.prediction_depth == 2
+    answers = [one.predict(observation, deterministic=True)[0] for one in (first, loaded)]
+    assert np.array_equal(*answers)
+
+
+@EACH
+@pytest.mark.parametrize("env", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
+    whole = make(agent, env).learn(120)
+    make(agent, env).learn(90, callback=ExactCheckpointCallback(60, tmp_path))
+    resumed = agent.resume(tmp_path, make(agent, env).get_env())
+    assert resumed.num_timesteps == 60
+    resumed.learn(60, reset_num_timesteps=False)
+    assert same(whole, resumed)
+
+
+@EACH
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"policy_kwargs": {"head_input": "observation"}}, "prediction_depth must be 0 with head_input='observation'"),
+        ({"policy_kwargs": {"head_input": "trunk"}}, "head_input must be one of .*'latent', 'observation'.*, got 'trunk'"),
+        ({"policy_kwargs": {"group": None}}, "group must be"),
+        ({"policy_kwargs": {"group": "none", "n_blocks": None}, "symmetry_coef": 1.0}, "must have inverses for the GET loss"),
+        ({"replay_buffer_class": PrioritizedSequenceReplayBuffer}, "must sample uniformly"),
+        ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
+        ({"aet_coef": -1.0}, "aet_coef must be a finite number >= 0, got -1.0"),
+        ({"aet_coeff": 1.0}, "Did you mean 'aet_coef'"),
+        ({"learning_starts": None}, "learning_starts must be an integer >= 0, got None"),
+        ({"policy_kwargs": {"latent_tau": None}}, "latent_tau must be"),
+        ({"policy_kwargs": {"n_block": 3}}, "unexpected argument 'n_block'. Did you mean 'n_blocks'"),
+        ({"policy_kwargs": {"optimizer_class": "Adem"}}, "a name in torch.optim"),
+        ({"policy_kwargs": {"projection": "head"}}, "projection must be one of"),
+        ({"policy_kwargs": {"whiten": True}, "batch_size": 1}, "batch_size must be an integer >= 2"),
+        ({"replay_buffer_kwargs": {"handle_timeouts": True}}, "unexpected argument 'handle_timeouts'"),
+        ({"n_blocks": 3}, "Pass policy_kwargs=dict\\(n_blocks=...\\)"),
+    ],
+    ids=lambda value: None if isinstance(value, dict) else value[:20],
+)
+def test_wrong_arguments_fail_before_the_first_step(agent, kwargs, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make(agent, **kwargs)
+    with pytest.raises(AssertionError, match="Use EqRQRDQN or EqRRainbow for a Discrete one"):
+        make(agent, "CartPole-v1")
+
+
+@EACH
+def test_an_encoder_that_no_loss_trains_is_reported(agent):
+    for kwargs in ({"prediction_depth": 0}, {"aet_coef": 0.0, "reward_coef": 0.0}):
+        with pytest.warns(UserWarning, match="actor and critics read an encoder that no loss trains"):
+            make(agent, **kwargs)
+
+
+@EACH
+def test_the_optimiser_is_found_by_its_name(agent):
+    policy = make(agent, policy_kwargs={"optimizer_class": "AdamW"}).policy
+    found = [policy.actor.optimizer, policy.critic.optimizer, policy.latent_optimizer]
+    assert all(type(one) is th.optim.AdamW for one in found)
+
+
+@EACH
+def test_float_images_and_other_optimisers(agent):
+    floats = spaces.Box(0, 1, (3, 40, 40), np.float32)
+    env = gym.wrappers.TransformObservation(MoveEnv(IMAGE), lambda image: (image / 255).astype(np.float32), floats)
+    model = make(agent, env, "CnnPolicy", policy_kwargs={"normalize_images": False, "optimizer_kwargs": {"foreach": True}})
+    assert model.learn(34)._n_updates == 4
+
+
+@EACH
+def test_pixels_are_not_shifted_for_an_encoder_that_flattens_them(agent):
+    assert make(agent, MoveEnv(IMAGE)).policy.augment.shifts == {"": 0}
+    assert make(agent, MoveEnv(IMAGE), "CnnPolicy").policy.augment.shifts == {"": 2}
+
+
+@EACH
+def test_averages_move_after_the_policy_was_moved(agent):
+    """Whitening has statistics, which PyTorch replaces by new tensors."""
+    model = make(agent, policy_kwargs={"whiten": True}).learn(60)
+    model.policy.double().float()
+    before = tensors(model.policy.latent_target)
+    model.train(1, 8)
+    after, online = tensors(model.policy.latent_target), tensors(model.policy.latent_model)
+    names = [name for name in after if "running" in name]
+    assert names and all(not th.equal(after[name], before[name]) for name in names)
+    assert all(after[name].shape == online[name].shape for name in names)
+
+
+@EACH
+def test_noise_that_a_checkpoint_does_not_keep_is_reported(agent, tmp_path):
+    for i, kwargs in enumerate(({"use_sde": True}, {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))})):
+        with pytest.warns(UserWarning, match="does not continue bit for bit"):
+            make(agent, **kwargs).learn(40, callback=ExactCheckpointCallback(20, tmp_path / str(i)))
+
+
+@EACH
+def test_a_short_run_and_an_idle_option_are_reported(agent):
+    with pytest.warns(UserWarning, match="no updates will be made"):
+        make(agent).learn(20)
+    with pytest.warns(UserWarning, match="optimize_memory_usage=True has no effect"):
+        make(agent, optimize_memory_usage=True)
