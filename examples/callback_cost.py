@@ -1,7 +1,7 @@
 """
 The cost of LatentCallback at its default interval: the time of one call, compared with that of the training steps in between.
 
-    python examples/callback_cost.py     # a sentence of docs/results/speed.md, some minutes
+    python examples/callback_cost.py     # a sentence of docs/latent_states.md, some minutes
 """
 
 import argparse

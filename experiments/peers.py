@@ -1,7 +1,7 @@
 """
 The tests of the installed versions of SB3 and sb3-contrib, run with our agents in place of theirs: EqRQRDQN replaces QRDQN,
-EqRRainbow replaces DQN. The source archives are downloaded from the package index. Exits with 1 if a test fails and
-no reason for it is listed.
+EqRRainbow DQN, EqRSAC SAC, EqRTQC TQC. The source archives are downloaded from the package index. Exits with 1 if a test
+fails and no reason for it is listed.
 
     python -m experiments.peers --out experiments/notes/peers.md
 """
@@ -19,7 +19,12 @@ import yaml
 
 from experiments import markdown
 
-SUITES = {"sb3-contrib": ("EqRQRDQN", "sb3_contrib.QRDQN"), "stable-baselines3": ("EqRRainbow", "stable_baselines3.DQN")}
+SUITES = [  # package, agent, the one that it replaces
+    ("sb3-contrib", "EqRQRDQN", "QRDQN"),
+    ("sb3-contrib", "EqRTQC", "TQC"),
+    ("stable-baselines3", "EqRRainbow", "DQN"),
+    ("stable-baselines3", "EqRSAC", "SAC"),
+]
 FILE = pathlib.Path(__file__).with_name("settings") / "peers.yml"
 REASONS: dict[str, str] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
 
@@ -35,11 +40,10 @@ def fetch(package: str, folder: pathlib.Path) -> pathlib.Path:
     return folder / archive.name.removesuffix(".tar.gz")
 
 
-def run(package: str, folder: pathlib.Path) -> dict[str, list[str]]:
+def run(package: str, agent: str, replaced: str, folder: pathlib.Path) -> dict[str, list[str]]:
     """:return: "passed", "failed" and "skipped" -> names of tests"""
-    agent, place = SUITES[package]
-    module, name = place.split(".")
-    (folder / "swap.py").write_text(f"import {module}\nfrom sb3_eqr import {agent}\n\n{module}.{name} = {agent}\n")
+    module = package.replace("-", "_")
+    (folder / "swap.py").write_text(f"import {module}\nfrom sb3_eqr import {agent}\n\n{module}.{replaced} = {agent}\n")
     report = folder / f"{package}.xml"
     command = [sys.executable, "-m", "pytest", "-p", "swap", "tests", "-k", agent, "-q", f"--junitxml={report}"]
     environment = {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(folder)}
@@ -58,14 +62,15 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, help="the Markdown page to write")
     args = parser.parse_args()
     rows, reasons, unexplained = [], [], 0
-    for package, (agent, _) in SUITES.items():
+    for package, agent, replaced in SUITES:
         with tempfile.TemporaryDirectory() as folder:
-            found = run(package, pathlib.Path(folder))
+            found = run(package, agent, replaced, pathlib.Path(folder))
         counts = [str(len(found[outcome])) for outcome in ("passed", "skipped", "failed")]
         rows.append([f"{package} {importlib.metadata.version(package)}", agent, *counts])
         for test in found["failed"]:
             module, _, name = test.partition(": ")
-            reason = REASONS.get(module) or REASONS.get(name.partition("[")[0])
+            function = name.partition("[")[0]
+            reason = REASONS.get(f"{agent} {function}") or REASONS.get(module) or REASONS.get(function)
             unexplained += reason is None
             reasons.append(f"- `{test}`: {reason or '**no reason is known**'}.")
     about = " ".join(__doc__.split("\n\n")[0].split())
