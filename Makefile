@@ -19,7 +19,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 demo: $(VENV)/installed
 ifeq ($(GAME),)
 	$(DEMO) examples/sliding_ball.py --out demo_results/ball
-	$(DEMO) examples/distractors.py
+	$(DEMO) examples/half_cheetah.py
 else
 	$(DEMO) examples/demo.py --game "$(GAME)" --config "$(CONFIG)" $(ARGS) $(if $(STEPS),--steps $(STEPS))
 endif
