@@ -147,7 +147,7 @@ def main() -> None:
     curves = dict(zip(AGENTS, found, strict=True))
     runs = {name: run(kind.load(args.out / name, device="cpu"), args.seed) for name, kind in AGENTS.items()}
     for name, (_, returns) in curves.items():
-        print(f"{name}: return {np.mean(returns[-2:]):.0f} in the last two episodes, then {runs[name].positions[-1]:.1f} m in 8 s")
+        print(f"{name}: return {np.mean(returns[-2:]):.0f} in the last two episodes, {runs[name].positions[-1]:.1f} m in 8 s")
     draw(runs, curves, args.steps, args.out / "demo.gif")
     print(args.out / "demo.gif")
 

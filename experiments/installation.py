@@ -23,12 +23,14 @@ TRAIN, RUN = "sb3-eqr train --algo eqr_qrdqn --env", "sb3-eqr benchmark run"
 COMMANDS = (
     f"{TRAIN} CartPole-v1 --eval-freq 5000 -n 3000 --eval-freq 1500 --eval-episodes 2",
     "sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render -n 200",
-    "sb3-eqr visualize with_eqr.zip --env SlidingBallDistractors-v0 --video",
+    "sb3-eqr visualize half_cheetah.zip --env HalfCheetah-v5",
     f"{RUN} results/first --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2 --steps 500",
     "sb3-eqr benchmark report results/first",
 )
 SHORTER = {
+    "learning_starts=2_000": "learning_starts=200",
     "learn(8_000": "learn(900",
+    "learn(12_000": "learn(400",
     "learn(20_000": "learn(200",
     "learn(100_000": "learn(400",
 }  # of Python blocks, run as one script per page
@@ -67,7 +69,7 @@ def install_and_run(python: str, folder: pathlib.Path) -> dict[str, str]:
     own_python = str(binaries / "python")
     subprocess.run(["git", "clone", "-q", str(ROOT), str(clone)], check=True)
     found = {"python -m venv .venv": run([python, "-m", "venv", str(folder / "venv")], folder, "venv")}
-    for extras in (".[atari]", ".[atari,benchmark,visualize]"):
+    for extras in (".[atari]", ".[atari,mujoco,benchmark,visualize]"):
         name = f'pip install -c constraints.txt "{extras}"'
         taken = run([own_python, "-m", *shlex.split(name)], clone, name)
         files = [path for path in packages.rglob("*") if path.is_file() and not path.is_symlink()]
