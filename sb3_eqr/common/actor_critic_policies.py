@@ -24,6 +24,7 @@ from sb3_eqr.common.checks.arguments import (
     with_fields_of,
 )
 from sb3_eqr.common.checks.validation import check_policy_kwargs
+from sb3_eqr.common.groups import Group
 from sb3_eqr.common.groups.layer import GroupLayer
 from sb3_eqr.common.latent.latent_model import LatentModel, frozen_copy
 from sb3_eqr.common.latent.options import LatentOptions
@@ -38,8 +39,12 @@ HEAD_INPUT = one_of(["latent", "observation"])
 
 @dataclass(frozen=True)
 class ActorCriticOptions(LatentOptions):
-    """As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head."""
+    """
+    As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. By default
+    the latent state is 72 unconstrained numbers, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
+    """
 
+    group: str | Group | None = "none(72)"
     latent_tau: float | None = option(0.005, SHARE)
     projection: str = option("own", one_of(["own", "none"]))
 
@@ -239,7 +244,7 @@ class EqRActorCriticPolicy(BasePolicy):
         options = self.options
         if options.group is None or options.transition != "group":
             raise ValueError(
-                f'group must be a group or "none", and transition "group", got {options.group!r} and {options.transition!r}. '
+                f'group must be a group or "none(72)", and transition "group", got {options.group!r} and {options.transition!r}. '
                 'Pass head_input="observation" and prediction_depth=0 for an agent without a latent model.'
             )
         kind = self.features_extractor_class

@@ -17,7 +17,7 @@ from sb3_eqr.eqr_tqc import EqRTQC
 from tests.models import same, tensors
 
 SMALL = {"learning_starts": 30, "buffer_size": 500, "batch_size": 8, "device": "cpu", "seed": 0}
-NETWORK = {"net_arch": [16], "latent_hidden_dim": 16, "n_blocks": 3}
+NETWORK = {"net_arch": [16], "latent_hidden_dim": 16, "group": "SE(2)", "n_blocks": 3}
 NET = {"net_arch": [16]}
 OFF = {"prediction_depth": 0, "policy_kwargs": {"head_input": "observation", **NET}}
 PAIRS = pytest.mark.parametrize("agent, stock", [(EqRSAC, SAC), (EqRTQC, TQC)], ids=["EqRSAC", "EqRTQC"])
@@ -89,6 +89,15 @@ def test_without_latent_model_images_and_normalised_environments_too(agent, stoc
     ]:
         ours = agent(policy, make_env(), **SMALL, **OFF).learn(34)
         assert same(ours, stock(policy, make_env(), **SMALL, policy_kwargs={"net_arch": [16]}).learn(34)), policy
+
+
+@EACH
+def test_the_default_latent_state_has_as_many_numbers_as_twelve_blocks_of_se2(agent):
+    sizes = [
+        agent("MlpPolicy", "Pendulum-v1", **SMALL, policy_kwargs=kwargs).policy.latent_model.state_dim
+        for kwargs in ({}, {"group": "SE(2)"})
+    ]
+    assert sizes == [72, 12 * 2 * 3]
 
 
 @EACH
