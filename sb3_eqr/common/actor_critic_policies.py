@@ -40,8 +40,8 @@ HEAD_INPUT = one_of(["latent", "observation"])
 @dataclass(frozen=True)
 class ActorCriticOptions(LatentOptions):
     """
-    As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. By default
-    the latent state is 72 unconstrained numbers, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
+    As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. The latent
+    state is 72 unconstrained numbers by default, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
     """
 
     group: str | Group | None = "none(72)"
@@ -244,7 +244,7 @@ class EqRActorCriticPolicy(BasePolicy):
         options = self.options
         if options.group is None or options.transition != "group":
             raise ValueError(
-                f'group must be a group or "none(72)", and transition "group", got {options.group!r} and {options.transition!r}. '
+                f'group must be a group or "none", and transition "group", got {options.group!r} and {options.transition!r}. '
                 'Pass head_input="observation" and prediction_depth=0 for an agent without a latent model.'
             )
         kind = self.features_extractor_class
