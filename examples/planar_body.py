@@ -34,10 +34,10 @@ AXES = ("forward", "turn")
 def train(path: pathlib.Path, seed: int) -> EqRSAC:
     """The agent of this seed, from its file if there is one."""
     if path.exists():
-        return EqRSAC.load(path)
+        return EqRSAC.load(path, device="cpu")
     model = EqRSAC(
         "MlpPolicy", ENV_ID, learning_rate=1e-3, batch_size=64, learning_starts=1_000, buffer_size=N_STEPS, seed=seed,
-        policy_kwargs=KWARGS,
+        policy_kwargs=KWARGS, device="cpu",
     )  # fmt: skip
     model.learn(N_STEPS)
     model.save(path)

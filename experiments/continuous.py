@@ -132,6 +132,8 @@ def area(run: dict[str, Any], after: int = 0, until: float = np.inf) -> float:
     """The mean return of the episodes that end after one step and until another: each weighs as many steps as it has."""
     steps, scores, lengths = (np.array(run["training"][key]) for key in ("step", "score", "length"))
     counted = (steps > after) & (steps <= until)
+    if not counted.any():
+        return np.nan
     return float(np.average(scores[counted], weights=lengths[counted]))
 
 

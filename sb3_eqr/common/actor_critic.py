@@ -14,7 +14,7 @@ from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments, integer
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.networks.optimizers import assign_gradients
-from sb3_eqr.common.objective import LatentObjective
+from sb3_eqr.common.objective import LatentObjective, keep_freed_memory
 from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
@@ -72,6 +72,7 @@ class EqRActorCritic(EqROffPolicy):
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), RULES)
+        validation.check_has_env(self)
         name, given = type(self).__name__, self.replay_buffer_kwargs
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
@@ -108,6 +109,7 @@ class EqRActorCritic(EqROffPolicy):
             policy = self.policy
             self.objective = LatentObjective(policy, policy.encoder, policy.latent_encoder, policy.augment)
             self._trained = [p for group in policy.latent_optimizer.param_groups for p in group["params"]]
+        keep_freed_memory()
 
     def _make_replay_buffer(self) -> SequenceReplayBuffer:
         return self._new_replay_buffer(self.replay_buffer_class or SequenceReplayBuffer, self.n_steps)
@@ -133,14 +135,16 @@ class EqRActorCritic(EqROffPolicy):
                 return
             self._find_reward_scale(buffer, gradient_steps)
             policy.set_training_mode(True)
-            rate = self.lr_schedule(max(self._current_progress_remaining, 0.0))  # below 0 in a rollout beyond the last step
-            update_learning_rate(policy.latent_optimizer, rate)
+            update_learning_rate(policy.latent_optimizer, self.lr_schedule(self._current_progress_remaining))
             self.replay_buffer = BeforeSamples(buffer, self._update_latent_model)  # type: ignore[assignment]
+        if policy.has_latent:
+            policy.reader.remembers = True
         try:
             super().train(gradient_steps, batch_size)  # type: ignore[misc]
         finally:
             self.replay_buffer = buffer
             if policy.has_latent:
+                policy.reader.remembers = False
                 policy.reader.forget()
 
     def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:
@@ -184,7 +188,10 @@ def spread_of(rewards: np.ndarray) -> float:
 
 
 class BeforeSamples:
-    """A replay buffer for one round of updates; each call of ``sample`` first passes windows of its own to a function."""
+    """
+    A replay buffer for one round of updates; each call of ``sample`` first passes windows of its own to a function, then draws
+    transitions without rollouts.
+    """
 
     def __init__(self, buffer: SequenceReplayBuffer, function: Callable[[SequenceReplayBufferSamples], None]):
         self._buffer = buffer
@@ -192,5 +199,10 @@ class BeforeSamples:
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
         """As that of the buffer."""
-        self._function(self._buffer.sample(batch_size, env))
-        return self._buffer.sample(batch_size, env)
+        buffer = self._buffer
+        self._function(buffer.sample(batch_size, env))
+        depth, buffer.prediction_depth = buffer.prediction_depth, 0
+        try:
+            return buffer.sample(batch_size, env)
+        finally:
+            buffer.prediction_depth = depth

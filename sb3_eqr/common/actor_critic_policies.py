@@ -18,7 +18,11 @@ from sb3_eqr.common.checks.arguments import (
     FLAG,
     POLICY,
     SHARE,
+    TEXT,
+    Rule,
+    a,
     check_arguments,
+    integer,
     one_of,
     option,
     with_fields_of,
@@ -34,17 +38,44 @@ from sb3_eqr.common.networks.optimizers import can_fuse, find_optimizer
 from sb3_eqr.common.networks.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
 
-HEAD_INPUT = one_of(["latent", "observation"])
+GROUP = TEXT | a(Group, "a group")
+NET_ARCH = Rule(
+    'a dictionary with the lists "pi" and "qf"', lambda value: isinstance(value, dict) and {*value} == {"pi", "qf"}
+)
+RULES = {
+    **POLICY,
+    "net_arch": POLICY["net_arch"] | NET_ARCH,
+    "n_critics": integer(1),
+    "head_input": one_of(["latent", "observation"]),
+    "reads_features": FLAG,
+    "shift_pixels": ALGORITHM["shift_pixels"],
+}
 
 
 @dataclass(frozen=True)
 class ActorCriticOptions(LatentOptions):
     """
-    As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. The latent
-    state is 72 unconstrained numbers by default, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
+    As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. By
+    default, the latent state is 72 unconstrained numbers, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
     """
 
-    group: str | Group | None = "none(72)"
+    group: str | Group = option("none(72)", GROUP)  # type: ignore[assignment]  # noqa: RUF009
+    transition: str = option("group", one_of(["group"]))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.group, str) and self.group.startswith("none"):
+            if self.n_blocks not in (None, 1):
+                raise ValueError(
+                    f"n_blocks must be None or 1 without a group, got {self.n_blocks}. "
+                    'Pass a group such as group="SE(2)", too, or another number of values such as group="none(72)".'
+                )
+            if not self.state_dependent_actions:
+                raise ValueError(
+                    f"state_dependent_actions must be True with group={self.group!r}, where it predicts by κ(s, a) alone, "
+                    'got False. Pass a group such as group="SE(2)".'
+                )
+
     latent_tau: float | None = option(0.005, SHARE)
     projection: str = option("own", one_of(["own", "none"]))
 
@@ -53,7 +84,7 @@ class LatentReader(BaseFeaturesExtractor):
     """
     What actor and critics read of observations: [s, h(s), x] of vectors, [h(s), x] of all others, or the same without h(s).
     h and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In train mode,
-    observations are augmented, and those of one batch are encoded only once, for actor and critics alike.
+    observations are augmented; in a round of updates, those of one batch are encoded only once, for actor and critics alike.
 
     :param observation_space: of the observations
     :param encoder: the moving average of the encoder, h
@@ -78,6 +109,7 @@ class LatentReader(BaseFeaturesExtractor):
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
         self._augment = augment
         self._plain = Augmentation(observation_space, augment._normalize_images, 0, 0.0)
+        self.remembers = False  # during a round of updates
         self._known: list[tuple[PyTorchObs, th.Tensor]] = []
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
@@ -88,7 +120,8 @@ class LatentReader(BaseFeaturesExtractor):
             if seen is observations:
                 return found
         found = self._read(self._augment(observations))
-        self._known = [*self._known[-1:], (observations, found)]  # an update has two batches
+        if self.remembers:
+            self._known = [*self._known[-1:], (observations, found)]  # an update has two batches
         return found
 
     @th.no_grad()
@@ -153,8 +186,9 @@ class EqRActorCriticPolicy(BasePolicy):
     :param layer_norm: whether layer norm follows the encoder
     :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
-    :param kwargs: the options of the latent model, :class:`~sb3_eqr.common.latent.options.LatentOptions`, and the other
-        arguments of the SB3 policy
+    :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
+        (https://arxiv.org/abs/2004.13649)
+    :param kwargs: the options of the latent model, :class:`ActorCriticOptions`, and the other arguments of the SB3 policy
     :raises ValueError: if an argument is out of range
     """
 
@@ -185,9 +219,7 @@ class EqRActorCriticPolicy(BasePolicy):
         shift_pixels: int = 4,
         **kwargs: Any,
     ):
-        check_arguments(
-            locals(), {**POLICY, "head_input": HEAD_INPUT, "reads_features": FLAG, "shift_pixels": ALGORITHM["shift_pixels"]}
-        )
+        check_arguments({**kwargs, **locals()}, RULES)
         options = {found.name: kwargs.pop(found.name) for found in fields(ActorCriticOptions) if found.name in kwargs}
         check_policy_kwargs(self, EqRActorCriticPolicy, kwargs)
         self.options = ActorCriticOptions(**options)
@@ -242,11 +274,6 @@ class EqRActorCriticPolicy(BasePolicy):
 
     def _make_latent_model(self) -> None:
         options = self.options
-        if options.group is None or options.transition != "group":
-            raise ValueError(
-                f'group must be a group or "none", and transition "group", got {options.group!r} and {options.transition!r}. '
-                'Pass head_input="observation" and prediction_depth=0 for an agent without a latent model.'
-            )
         kind = self.features_extractor_class
         trunk_kwargs = with_image_scale(kind, self.features_extractor_kwargs, self.normalize_images)
         self.encoder = make_trunk(kind, self.observation_space, trunk_kwargs, self.layer_norm, False)

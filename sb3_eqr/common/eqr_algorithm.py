@@ -243,8 +243,7 @@ class EqRAlgorithm(EqROffPolicy):
 
     def _check_arguments(self) -> None:
         check_arguments(vars(self), ALGORITHM)
-        if getattr(self, "observation_space", None) is None:
-            raise ValueError("env must be an environment or the name of a registered one, got None.")
+        validation.check_has_env(self)
         name = type(self).__name__
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
@@ -315,11 +314,6 @@ class EqRAlgorithm(EqROffPolicy):
             self.policy.update_target(self.tau)
         self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last rollout may exceed the total number of steps, where a linear schedule would give a negative learning rate.
-        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """

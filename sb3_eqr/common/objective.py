@@ -1,4 +1,4 @@
-"""The objective of one update (Eq. 21): computes the losses of samples. ``EqRAlgorithm.train`` applies them."""
+"""The objective of one update (Eq. 21): computes the losses of samples. ``train`` of the agents applies them."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol

@@ -145,5 +145,10 @@ class EqROffPolicy(FiniteData, SafeFiles):
                 if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
                     state[name] = th.empty_like(parameter).copy_(value)  # fused kernels need the same memory layout
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)  # type: ignore[misc]
+        # The last rollout may exceed the total number of steps, where a linear schedule would give a negative learning rate.
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite

@@ -7,11 +7,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_eqr.common.checks.arguments import check, integer, number
+from sb3_eqr.common.checks.arguments import Rule, check, integer, number
 
 SPEED = 0.2  # units of length per step, at full command
 TURN = 0.5  # radians per step, at full command
 START = 1.0  # bodies start in a square of this half-width
+POSITION = Rule("two finite numbers", lambda value: len(value) == 2 and all(number().holds(part) for part in value))
 
 
 class PlanarBody(gym.Env):
@@ -45,6 +46,7 @@ class PlanarBody(gym.Env):
         drawn = {"position": self.np_random.uniform(-START, START, 2), "angle": self.np_random.uniform(-pi, pi)}
         state = {**drawn, **(options or {})}
         check("angle", state["angle"], number())
+        check("position", list(state["position"]), POSITION)
         self.position, self.angle = np.array(state["position"], dtype=float), remainder(state["angle"], 2 * pi)
         return self._seen()
 

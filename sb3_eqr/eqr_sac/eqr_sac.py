@@ -67,7 +67,8 @@ class EqRSAC(EqRActorCritic, SAC):
         _init_setup_model: bool = True,
     ):
         """
-        All parameters but the next four are those of SB3's SAC, with the same defaults.
+        Parameters and defaults are those of SB3's SAC, and the next four. ``policy_kwargs`` has more keys,
+        ``replay_buffer_class`` must be a :class:`~sb3_eqr.SequenceReplayBuffer`, ``optimize_memory_usage`` has no effect.
 
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: weight ≥ 0 of the action-equivariant transition loss, a mean over steps; 0 disables it

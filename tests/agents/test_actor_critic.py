@@ -1,5 +1,7 @@
 """EqRSAC and EqRTQC: SAC and TQC, unchanged, beside a latent model that is trained apart."""
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -185,7 +187,6 @@ def test_actor_and_critics_see_one_augmentation_of_each_batch(agent):
     policy.latent_encoder.register_forward_hook(lambda module, inputs, output: encoded.append(inputs[0]))
     model.train(3, 8)
     assert len(encoded) == 3 * 3  # the rollout, s and s' of each update
-    assert all(len({batch.sum().item() for batch in encoded[i : i + 3]}) == 3 for i in (0, 3, 6))
     assert policy.reader._known == []
     for kwargs in ({}, {"prediction_depth": 0}):
         assert make(agent, **kwargs).learn(60).policy.reader._known == []
@@ -202,8 +203,9 @@ def test_rewards_are_divided_by_their_spread(agent):
     assert after(MoveEnv(), 90) == 1.0  # too few
     assert after(VecNormalize(make_vec_env(MoveEnv, 1)), 130) == 1.0
     assert after(VecNormalize(make_vec_env(MoveEnv, 1), norm_reward=False), 130) not in (0.0, 1.0)
-    constant = gym.wrappers.TransformReward(MoveEnv(), lambda reward: -0.1)
-    assert after(constant, 130) == 1.0  # in float32 their standard deviation is not quite 0
+    rewards = itertools.cycle([-0.1, -0.1 + 2e-8])
+    constant = gym.wrappers.TransformReward(MoveEnv(), lambda reward: next(rewards))
+    assert after(constant, 130) == 1.0  # rounding in float32
 
 
 @EACH
@@ -320,6 +322,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
         ({"policy_kwargs": {"head_input": "observation"}}, "prediction_depth must be 0 with head_input='observation'"),
         ({"policy_kwargs": {"head_input": "trunk"}}, "head_input must be one of .*'latent', 'observation'.*, got 'trunk'"),
         ({"policy_kwargs": {"group": None}}, "group must be"),
+        ({"policy_kwargs": {"group": "none(72)", "n_blocks": 3}}, "n_blocks must be None or 1 without a group, got 3"),
+        (
+            {"policy_kwargs": {"group": "none", "n_blocks": None, "state_dependent_actions": False}},
+            "state_dependent_actions must be True with group='none'",
+        ),
         ({"policy_kwargs": {"group": "none", "n_blocks": None}, "symmetry_coef": 1.0}, "must have inverses for the GET loss"),
         ({"replay_buffer_class": PrioritizedSequenceReplayBuffer}, "must sample uniformly"),
         ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
@@ -330,7 +337,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
         ({"policy_kwargs": {"n_block": 3}}, "unexpected argument 'n_block'. Did you mean 'n_blocks'"),
         ({"policy_kwargs": {"optimizer_class": "Adem"}}, "a name in torch.optim"),
         ({"policy_kwargs": {"projection": "head"}}, "projection must be one of"),
-        ({"policy_kwargs": {"whiten": True}, "batch_size": 1}, "batch_size must be an integer >= 2"),
+        ({"batch_size": 1}, "batch_size must be an integer >= 2"),
+        ({"policy_kwargs": {"optimizer_kwargs": 3}}, "optimizer_kwargs must be a dictionary"),
+        ({"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn must be a class of torch.nn"),
+        ({"policy_kwargs": {"net_arch": [0]}}, "net_arch must be a list of integers"),
+        ({"policy_kwargs": {"transition": "convolutional"}}, "transition must be one of"),
         ({"replay_buffer_kwargs": {"handle_timeouts": True}}, "unexpected argument 'handle_timeouts'"),
         ({"n_blocks": 3}, "Pass policy_kwargs=dict\\(n_blocks=...\\)"),
     ],

@@ -243,6 +243,12 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
             )
 
 
+def check_has_env(algorithm: Any) -> None:
+    """Raise ValueError for an algorithm that was made with ``env=None``."""
+    if getattr(algorithm, "observation_space", None) is None:
+        raise ValueError("env must be an environment or the name of a registered one, got None.")
+
+
 def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, initial_gamma: float | None) -> None:
     """Raise ValueError if there is no loss, if a batch has no pairs, or if γ = 1 is to be annealed."""
     if td_coef == 0 and depth == 0:
