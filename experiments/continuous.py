@@ -48,6 +48,7 @@ ARMS: dict[str, dict[str, Any] | None] = {
     "no_features": {"policy_kwargs": {**NONE, "reads_features": False}},
     "one_step": {"policy_kwargs": NONE, "prediction_depth": 1},
     "five_steps": {"policy_kwargs": NONE, "prediction_depth": 5},
+    "cheaper": {"policy_kwargs": {**NONE, "reads_features": False}, "prediction_depth": 1},
 }
 
 
