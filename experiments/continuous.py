@@ -151,9 +151,10 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
 def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, is_timed: bool) -> str:
     """
     Areas by task and arm; ratios to the baseline's, geometric mean over tasks, bootstrap interval over seeds. If timed, each
-    arm's area only until the step that it reaches in the time of the baseline's whole run.
+    arm's area only until the step that it reaches in the time of the baseline's whole run. Times are those of the fastest
+    seed, since others had to share a core.
     """
-    seconds = {key: float(np.mean([run["seconds"] for run in of_key.values()])) for key, of_key in runs.items()}
+    seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
     for key, of_key in runs.items():
         share = seconds.get((key[0], baseline), np.nan) / seconds[key] if is_timed else np.inf
@@ -170,12 +171,19 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str
             error = f" ± {values.std(ddof=1) / len(values) ** 0.5:,.0f}" if len(values) > 1 else ""
             cells.append(f"{values.mean():,.0f}{error} ({len(values)}; {seconds[task, arm] / 60:.1f} min)")
             pair = values, of_baseline
+            if min(values.mean(), of_baseline.mean()) <= 0:
+                continue  # a ratio would say nothing
             draws = [sample[rng.integers(len(sample), size=(10_000, len(sample)))].mean(axis=1) for sample in pair]
             ratios.append(np.append(draws[0] / draws[1], values.mean() / of_baseline.mean()))
+        shown = ""
         if ratios:
             mean = np.exp(np.mean(np.log(np.maximum(ratios, 1e-3)), axis=0))
             low, high = np.percentile(mean[:-1], [2.5, 97.5])
-            table.append([arm, *cells, f"{mean[-1]:.2f} [{low:.2f}, {high:.2f}], {len(ratios)} tasks"])
+            has_interval = min(len(areas[task, arm]) for task in tasks if (task, arm) in areas) > 1
+            interval = f" [{low:.2f}, {high:.2f}]" if has_interval else ""
+            shown = f"{mean[-1]:.2f}{interval}, {len(ratios)} tasks"
+        if any(cells):
+            table.append([arm, *cells, shown])
     return markdown(["arm", *tasks, f"ratio to {baseline}, geometric mean"], table)
 
 

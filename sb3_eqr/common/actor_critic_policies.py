@@ -61,6 +61,8 @@ class ActorCriticOptions(LatentOptions):
 
     group: str | Group = option("none(72)", GROUP)  # type: ignore[assignment]  # noqa: RUF009
     transition: str = option("group", one_of(["group"]))
+    latent_tau: float | None = option(0.005, SHARE)
+    projection: str = option("own", one_of(["own", "none"]))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,9 +77,6 @@ class ActorCriticOptions(LatentOptions):
                     f"state_dependent_actions must be True with group={self.group!r}, where it predicts by κ(s, a) alone, "
                     'got False. Pass a group such as group="SE(2)".'
                 )
-
-    latent_tau: float | None = option(0.005, SHARE)
-    projection: str = option("own", one_of(["own", "none"]))
 
 
 class LatentReader(BaseFeaturesExtractor):

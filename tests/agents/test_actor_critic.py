@@ -14,6 +14,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import ExactCheckpointCallback, PrioritizedSequenceReplayBuffer
+from sb3_eqr.common.actor_critic import BeforeSamples
 from sb3_eqr.eqr_sac import EqRSAC
 from sb3_eqr.eqr_tqc import EqRTQC
 from tests.models import same, tensors
@@ -190,6 +191,36 @@ def test_actor_and_critics_see_one_augmentation_of_each_batch(agent):
     assert policy.reader._known == []
     for kwargs in ({}, {"prediction_depth": 0}):
         assert make(agent, **kwargs).learn(60).policy.reader._known == []
+
+
+@EACH
+def test_nothing_is_remembered_outside_of_updates(agent):
+    critic = make(agent).learn(60).critic.train()
+    observation, action = th.rand(5, 3), th.rand(5, 2)
+    before = th.cat(list(critic(observation, action)))
+    observation.neg_()
+    assert not th.equal(th.cat(list(critic(observation, action))), before)
+
+
+@EACH
+def test_the_algorithm_draws_as_without_a_latent_model(agent):
+    """The second draw of an update has no rollout, and equals that of a buffer with M = 0 in the same random state."""
+    model = make(agent).learn(60)
+    buffer, latent = model.replay_buffer, []
+    random_state = np.random.get_state()
+    second = BeforeSamples(buffer, latent.append).sample(8)
+    assert latent[0].rollout_observations.shape == (8, 2, 3) and second.rollout_observations is None
+    np.random.set_state(random_state)
+    buffer.sample(8)
+    buffer.prediction_depth = 0
+    assert all(th.equal(a, b) for a, b in zip(second[:5], buffer.sample(8)[:5], strict=True))
+
+
+@EACH
+def test_no_learning_rate_is_negative_in_the_last_rollout(agent):
+    env = make_vec_env(MoveEnv, 8)
+    model = make(agent, env, learning_rate=lambda remaining: 1e-3 * remaining).learn(100)  # 104 steps
+    assert {group["lr"] for optimizer in model._optimizers() for group in optimizer.param_groups} == {0.0}
 
 
 @EACH

@@ -446,6 +446,12 @@ def test_the_planar_body_moves_by_elements_of_SE2():
     assert info["angle"] == pytest.approx(7.0 - 2 * pi) and tuple(info["position"]) == (0.5, -0.25)
 
 
+@pytest.mark.parametrize("position", [(np.nan, 0.0), (0.0, 0.0, 0.0)])
+def test_a_planar_body_starts_at_two_finite_numbers(position):
+    with pytest.raises(ValueError, match="position must be two finite numbers"):
+        PlanarBody().reset(options={"position": position})
+
+
 def test_the_noise_of_the_planar_body_does_not_move_it():
     quiet, noisy = gym.make("PlanarBody-v0"), gym.make("PlanarBodyNoise-v0")
     for env in (quiet, noisy):
