@@ -38,6 +38,11 @@ ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL 
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
 NONE: dict[str, Any] = {"group": "none(72)", "n_blocks": 1}  # as many numbers as SE(2)^12
+NARROW: dict[str, Any] = {
+    "reads_features": False,
+    "latent_hidden_dim": 128,
+    "features_extractor_kwargs": {"features_dim": 128},
+}
 # name -> arguments of EqRSAC, None for SAC
 ARMS: dict[str, dict[str, Any] | None] = {
     "sac": None,
@@ -49,6 +54,8 @@ ARMS: dict[str, dict[str, Any] | None] = {
     "one_step": {"policy_kwargs": NONE, "prediction_depth": 1},
     "five_steps": {"policy_kwargs": NONE, "prediction_depth": 5},
     "cheaper": {"policy_kwargs": {**NONE, "reads_features": False}, "prediction_depth": 1},
+    "narrow": {"policy_kwargs": {**NONE, **NARROW}, "prediction_depth": 1},
+    "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
 }
 
 
