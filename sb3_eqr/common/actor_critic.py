@@ -23,6 +23,7 @@ RULES = {**ALGORITHM, "learning_starts": integer(0), "target_update_interval": i
 SCALE_INTERVAL = 1_000  # updates between two estimates of the rewards' spread, each of which takes all rewards
 MIN_REWARDS = 100  # for an estimate
 MIN_SPREAD = 1e-4  # as a share of the largest reward; below, it may be rounding
+MAX_REWARD = 10.0  # in units of the spread, as VecNormalize's clip_reward: a first rare reward is far beyond the last estimate
 
 
 class EqRActorCritic(EqROffPolicy):
@@ -151,7 +152,8 @@ class EqRActorCritic(EqROffPolicy):
         """One update of encoder and latent model, and of their moving averages."""
         policy, objective = self.policy, self.objective
         assert samples.rollout_rewards is not None
-        samples = samples._replace(rollout_rewards=samples.rollout_rewards / self.reward_scale)
+        rewards = (samples.rollout_rewards / self.reward_scale).clamp(-MAX_REWARD, MAX_REWARD)
+        samples = samples._replace(rollout_rewards=rewards)
         observations = objective.augment(samples.observations)
         features = policy.encoder(observations)
         names = [name for name, coef in self.loss_coefs.items() if coef > 0]
@@ -164,14 +166,11 @@ class EqRActorCritic(EqROffPolicy):
         self._monitor.add({f"{name}_loss": mean.detach() for name, mean in means.items()})
 
     def _find_reward_scale(self, buffer: SequenceReplayBuffer, gradient_steps: int) -> None:
-        """Estimate the standard deviation of the rewards again, if it is due; 1 if VecNormalize scales them."""
+        """Estimate the standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
         rewards = buffer.rewards[: buffer.size()]
         is_due = -self._n_updates % SCALE_INTERVAL < gradient_steps or rewards.size < SCALE_INTERVAL
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.norm_reward:
-            self.reward_scale = 1.0
-        elif is_due and rewards.size >= MIN_REWARDS:
-            self.reward_scale = spread_of(rewards)
+        if is_due and rewards.size >= MIN_REWARDS:
+            self.reward_scale = spread_of(buffer._normalize_reward(rewards, self._vec_normalize_env))
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_monitor", "objective", "_trained"]

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_eqr.common.checks.arguments import (
@@ -32,7 +32,15 @@ from sb3_eqr.common.groups import Group
 from sb3_eqr.common.groups.layer import GroupLayer
 from sb3_eqr.common.latent.latent_model import LatentModel, frozen_copy
 from sb3_eqr.common.latent.options import LatentOptions
-from sb3_eqr.common.networks.encoders import TwoLayerExtractor, find_trunk, is_flat, make_trunk, with_image_scale
+from sb3_eqr.common.networks.encoders import (
+    ConvExtractor,
+    DictExtractor,
+    TwoLayerExtractor,
+    find_trunk,
+    is_flat,
+    make_trunk,
+    with_image_scale,
+)
 from sb3_eqr.common.networks.inputs import Augmentation, keys_of
 from sb3_eqr.common.networks.optimizers import can_fuse, find_optimizer
 from sb3_eqr.common.networks.target_copy import TargetCopy
@@ -169,6 +177,20 @@ class PredictsState(ReadsLatent):
                 parameter.requires_grad_(True)
 
 
+class ForImages:
+    """Mixin, listed before an actor-critic policy for vectors: the encoder is the paper's three convolutions."""
+
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = ConvExtractor
+    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = NatureCNN
+
+
+class ForDicts:
+    """Mixin, listed before an actor-critic policy for vectors: observations are dicts."""
+
+    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = DictExtractor
+    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor
+
+
 class EqRActorCriticPolicy(BasePolicy):
     """
     Mixin, listed before a policy of SB3 with an actor and critics. It adds the encoder, the latent model, their moving
@@ -194,7 +216,7 @@ class EqRActorCriticPolicy(BasePolicy):
     actor_class: ClassVar[type[ReadsLatent]]
     critic_class: ClassVar[type[PredictsState]]
     default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = TwoLayerExtractor
-    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]]
+    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
     encoder: BaseFeaturesExtractor

@@ -1,14 +1,10 @@
 """Policies of EqRSAC: SB3's SAC policies, whose actor and critics also read a latent state."""
 
-from typing import ClassVar
-
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy, PredictsState, ReadsLatent
-from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
+from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy, ForDicts, ForImages, PredictsState, ReadsLatent
 from sb3_eqr.common.type_aliases import PyTorchObs
 
 
@@ -28,21 +24,14 @@ class EqRSACPolicy(EqRActorCriticPolicy, SACPolicy):
 
     actor_class = EqRSACActor
     critic_class = EqRSACCritic
-    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
 
 MlpPolicy = EqRSACPolicy
 
 
-class CnnPolicy(EqRSACPolicy):
+class CnnPolicy(ForImages, EqRSACPolicy):
     """:class:`EqRSACPolicy` for images: the encoder is the paper's three convolutions."""
 
-    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = ConvExtractor
-    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = NatureCNN
 
-
-class MultiInputPolicy(EqRSACPolicy):
+class MultiInputPolicy(ForDicts, EqRSACPolicy):
     """:class:`EqRSACPolicy` for dict observations."""
-
-    default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = DictExtractor
-    stock_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor

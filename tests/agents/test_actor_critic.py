@@ -232,11 +232,28 @@ def test_rewards_are_divided_by_their_spread(agent):
         return make(agent, env, learning_starts=0).learn(n).reward_scale
 
     assert after(MoveEnv(), 90) == 1.0  # too few
-    assert after(VecNormalize(make_vec_env(MoveEnv, 1)), 130) == 1.0
+    normalize = VecNormalize(make_vec_env(MoveEnv, 1))
+    normalized = make(agent, normalize, learning_starts=0).learn(130)
+    expected = normalized.replay_buffer.rewards[:130].std() / float(normalize.ret_rms.var) ** 0.5
+    assert normalized.reward_scale == pytest.approx(expected, rel=0.1)
     assert after(VecNormalize(make_vec_env(MoveEnv, 1), norm_reward=False), 130) not in (0.0, 1.0)
     rewards = itertools.cycle([-0.1, -0.1 + 2e-8])
     constant = gym.wrappers.TransformReward(MoveEnv(), lambda reward: next(rewards))
     assert after(constant, 130) == 1.0  # rounding in float32
+
+
+@EACH
+def test_a_reward_far_beyond_the_last_estimate_counts_as_ten_spreads(agent, monkeypatch):
+    model = make(agent, learning_starts=100).learn(130)
+    seen, losses = [], model.objective.latent_losses
+    monkeypatch.setattr(
+        model.objective, "latent_losses", lambda *args: [seen.append(args[1].rollout_rewards), losses(*args)][1]
+    )
+    model.reward_scale = 0.5
+    samples = model.replay_buffer.sample(2)
+    rewards = th.tensor([[1.0, 1e4], [-1e4, -3.0]])
+    model._update_latent_model(samples._replace(rollout_rewards=rewards))
+    assert seen[0].tolist() == [[2.0, 10.0], [-10.0, -6.0]]
 
 
 @EACH
