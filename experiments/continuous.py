@@ -32,7 +32,9 @@ from sb3_eqr import EqRSAC
 from sb3_eqr.common.saving.files import atomic_write
 
 PIXELS, N_TORQUES = "PixelPendulum-v0", 201
-TASKS = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5", PIXELS]
+NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
+COMPARED = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5"]
+TASKS = [*COMPARED, "HalfCheetah-v5+noise", PIXELS]
 N_STEPS, N_SHORT, N_RANDOM_SHORT = 100_000, 12_000, 2_000
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
@@ -95,8 +97,22 @@ class Episodes(BaseCallback):
         return True
 
 
+class Noise(gym.ObservationWrapper):
+    """Adds independent standard normal numbers to observations, which no action changes."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        (size,) = env.observation_space.shape  # type: ignore[misc]
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size + N_NOISE,))
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        return np.concatenate([observation, self.np_random.standard_normal(N_NOISE)]).astype(np.float32)
+
+
 def make_env(task: str) -> gym.Env:
     """The environment; the torque of the pendulum from pixels is made continuous, to 1%."""
+    if task.endswith(NOISE):
+        return Noise(gym.make(task.removesuffix(NOISE)))
     if task != PIXELS:
         return gym.make(task)
     torque = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -209,7 +225,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     running = commands.add_parser("train", help="run what is not in the folder yet")
     running.add_argument("folder", type=pathlib.Path)
-    running.add_argument("--tasks", nargs="+", default=TASKS[:-1])
+    running.add_argument("--tasks", nargs="+", default=COMPARED)
     running.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
