@@ -45,12 +45,12 @@ NARROW: dict[str, Any] = {
     "latent_hidden_dim": 128,
     "features_extractor_kwargs": {"features_dim": 128},
 }
-# name -> arguments of EqRSAC, None for SAC
-ARMS: dict[str, dict[str, Any] | None] = {
-    "sac": None,
+OF_SAC: dict[str, dict[str, Any]] = {"sac": {}, "sac_layer_norm": {}, "sac_two_updates": {"gradient_steps": 2}}
+# name -> arguments of SAC, or of EqRSAC
+ARMS: dict[str, dict[str, Any]] = {
+    **OF_SAC,
     "se2": {"policy_kwargs": {"group": "SE(2)", "n_blocks": 12}},
     "none": {"policy_kwargs": NONE},
-    "sac_layer_norm": None,
     "no_losses": {"policy_kwargs": NONE, "prediction_depth": 0},
     "no_features": {"policy_kwargs": {**NONE, "reads_features": False}},
     "one_step": {"policy_kwargs": NONE, "prediction_depth": 1},
@@ -126,12 +126,12 @@ def nearest_torque(action: np.ndarray) -> int:
 
 def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC:
     """An agent at RL Zoo's settings, or with small networks that learn in short runs."""
-    given = dict(ARMS[arm] or {})
+    given = dict(ARMS[arm])
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
-    if ARMS[arm] is None:
-        return SAC(LayerNormPolicy if arm == "sac_layer_norm" else policy, env, **shared)
+    if arm in OF_SAC:
+        return SAC(LayerNormPolicy if arm == "sac_layer_norm" else policy, env, **given, **shared)
     return EqRSAC(policy, env, **given, **shared)
 
 
@@ -249,7 +249,7 @@ def main() -> None:
         with atomic_write(args.pack, "xz") as out:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
-        draw(rows(runs, ["none", "sac"]), "return", args.figure, ["SAC with a latent model", "SAC"])
+        draw(rows(runs, ["none", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
     print(report(runs, args.to, args.after, args.equal_time))
 
 
