@@ -57,18 +57,18 @@ def angles(model: EqRSAC, axis: int) -> np.ndarray:
 
 def draw(file: pathlib.Path, model: EqRSAC) -> None:
     """The angles of κ over commands, beside the angle by which the body turns."""
+    turned = angles(model, AXES.index("turn"))[-1]
+    sign = np.sign(turned[np.abs(turned).argmax()])  # which direction a block counts as positive is free
     with styled():
-        figure, panels = plt.subplots(1, 2, figsize=(7, 3), sharey=True, layout="constrained")
+        figure, panels = plt.subplots(2, 1, figsize=(3.9, 4.8), layout="constrained")
         for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
             for k, values in enumerate(angles(model, axis).T):
                 panel.plot(COMMANDS, values, color=COLORS[k], label=f"block {k + 1}")
-            for sign in (1, -1):
-                turned = sign * TURN * COMMANDS * (axis == 1)
-                panel.plot(COMMANDS, turned, color="black", linestyle=":", label="the body's turn, ±" if sign > 0 else None)
-            panel.set_xlabel(f"command: {name}")
-        panels[0].set_ylabel("angle of κ(a), radians")
-        panels[0].legend(loc="lower left")
-        figure.savefig(file, dpi=150)
+            panel.plot(COMMANDS, sign * TURN * COMMANDS * (axis == 1), color="black", linestyle=":", label="the body")
+            panel.set(xlabel=f"command: {name}", ylim=(-1.1 * TURN, 1.1 * TURN))
+        figure.supylabel("angle of κ(a), radians", fontsize="medium")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        figure.savefig(file, dpi=200)
         plt.close(figure)
 
 

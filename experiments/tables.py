@@ -6,7 +6,7 @@ folders of a benchmark or files of packed runs.
         --measures goals score R2 skill
     python -m experiments.tables docs/results/ablation.jsonl.xz --measures score end skill --baseline recipe --ratio
     python -m experiments.tables docs/results/atari100k/gpu.jsonl.xz --games Boxing --measures 0-20000 20000-40000
-    python -m experiments.tables docs/results/worlds.jsonl.xz --games torus_of_4 torus_of_8 --figure goals distractors.png
+    python -m experiments.tables docs/results/first_page.jsonl.xz --agents aet_5 plain --figure goals distractors.png
     python -m experiments.tables docs/results --differences differences.png
     python -m experiments.tables --published
 
@@ -242,10 +242,10 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
                     axis.fill_between(steps, mean - width, mean + width, color=look.color, alpha=0.15, lw=0)
             axis.set(title=TITLES.get(game, game), xlim=(0, None), ylim=(min(0, axis.get_ylim()[0]), None))
             axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.tick_params(labelbottom=True)
             axis.grid(axis="y")
         for axis in axes.flat[len(games) :]:
             axis.set_axis_off()
-            axes[-2, -1].tick_params(labelbottom=True)  # nothing is below it
         lines = {str(line.get_label()): line for axis in axes.flat for line in axis.get_lines()}
         figure.supxlabel("training steps (thousands)", fontsize="medium")
         figure.supylabel(AXES.get(what, what), fontsize="medium")

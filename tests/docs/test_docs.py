@@ -122,6 +122,7 @@ BLOCKS = {
     "sh": check_sh,
     "yaml": check_yaml,
     "text": check_nothing,
+    "diff": check_nothing,
     "": check_nothing,
     "{eval-rst}": check_eval_rst,
     "{literalinclude}": check_literalinclude,
@@ -357,7 +358,6 @@ STORY = [  # lines of the pages in a working order, and arguments that shorten t
         "python examples/blind_cliffwalk.py --seeds 10 --json docs/results/cliffwalk.json",
         "--seeds 1 --states 2 --json cliffwalk.json",
     ),
-    ("python examples/random_play.py", "--episodes 2"),
 ]
 
 
