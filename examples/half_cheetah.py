@@ -91,15 +91,15 @@ def draw_curves(axes: Any, curves: dict[str, tuple[list[int], list[float]]], ste
             scores = np.array([row["score"] for row in runs])
             band = scores.min(axis=0), scores.max(axis=0)
             axes.fill_between(runs[0]["step"], *band, color=look.color, alpha=0.15, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel="return while learning", xlim=(0, steps))
+    axes.set(xlabel="environment steps", ylabel="return while learning", xlim=(0, steps), xticks=range(0, steps + 1, 5_000))
     axes.legend(loc="upper left")
     axes.grid()
 
 
 def draw(runs: dict[str, Run], curves: dict[str, tuple[list[int], list[float]]], steps: int, path: pathlib.Path) -> None:
     """Write the picture: the film on the left, the curves on the right."""
-    with styled(), plt.rc_context({"font.size": 12, "legend.fontsize": 12}):
-        figure = plt.figure(figsize=(9, 4), dpi=100, layout="constrained")
+    with styled(), plt.rc_context({"font.size": 18, "legend.fontsize": 18}):
+        figure = plt.figure(figsize=(9, 4.8), dpi=100, layout="constrained")
         worlds = figure.subplot_mosaic([[name, "curves"] for name in AGENTS], width_ratios=(4, 4))
         draw_curves(worlds.pop("curves"), curves, steps)
         bodies, labels, marks = {}, {}, {}
@@ -112,7 +112,7 @@ def draw(runs: dict[str, Run], curves: dict[str, tuple[list[int], list[float]]],
             axes.axhline(0, color=GREY, linewidth=1)
             bodies[name] = axes.add_collection(LineCollection([], colors=look.color, capstyle="round"))
             labels[name] = axes.text(-HALF_WIDTH, HEIGHT, "", va="top", color=INK)
-            marks[name] = [axes.text(0, -0.04, "", ha="center", va="top", color=GREY, fontsize=9) for _ in range(7)]
+            marks[name] = [axes.text(0, -0.04, "", ha="center", va="top", color=GREY, fontsize=13) for _ in range(7)]
 
         def frame(t: int) -> list[Any]:
             for name, found in runs.items():

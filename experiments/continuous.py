@@ -27,7 +27,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from experiments import markdown
-from experiments.tables import draw
+from experiments.tables import PARTS, draw
 from sb3_eqr import EqRSAC
 from sb3_eqr.common.saving.files import atomic_write
 
@@ -211,13 +211,15 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str
 
 
 def rows(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], arms: Sequence[str]) -> list[dict[str, Any]]:
-    """The runs of these arms as rows of a benchmark, for ``experiments.tables``."""
-    found = [
-        run for (_, arm), of_key in sorted(runs.items(), key=lambda item: TASKS.index(item[0][0])) for run in of_key.values()
-    ]
-    named = {"agent": "arm", "game": "task", "seed": "seed", "training": "training"}
-    kept = sorted((run for run in found if run["arm"] in arms), key=lambda run: arms.index(run["arm"]))
-    return [{**{key: run[name] for key, name in named.items()}, "protocol": {"steps": run["steps"]}} for run in kept]
+    """The runs of these arms as rows for ``experiments.tables``, with the area of each tenth."""
+    found = []
+    for arm, task in ((arm, task) for arm in arms for task in TASKS):
+        for run in runs.get((task, arm), {}).values():
+            tenth = run["steps"] // PARTS
+            areas = [area(run, start, start + tenth) for start in range(0, run["steps"], tenth)]
+            row = {"agent": arm, "game": task, "seed": run["seed"], "tenths": {"return": areas}}
+            found.append({**row, "protocol": {"steps": run["steps"]}})
+    return found
 
 
 def main() -> None:
