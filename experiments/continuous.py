@@ -27,7 +27,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from experiments import markdown
-from experiments.tables import PARTS, draw
+from experiments.tables import PARTS, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC
 from sb3_eqr.common.saving.files import atomic_write
 
@@ -173,9 +173,9 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
 
 def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, is_timed: bool) -> str:
     """
-    Areas by task and arm; ratios to the baseline's, geometric mean over tasks, bootstrap interval over seeds. If timed, each
-    arm's area only until the step that it reaches in the time of the baseline's whole run. Times are those of the fastest
-    seed, since others had to share a core.
+    Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
+    over tasks, bootstrap interval over seeds. If timed, each arm's area only until the step that it reaches in the time of the
+    baseline's whole run. Times are those of the fastest seed, since others had to share a core.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
@@ -191,8 +191,8 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str
             if values is None:
                 cells.append("")
                 continue
-            error = f" ± {values.std(ddof=1) / len(values) ** 0.5:,.0f}" if len(values) > 1 else ""
-            cells.append(f"{values.mean():,.0f}{error} ({len(values)}; {seconds[task, arm] / 60:.1f} min)")
+            gain = "" if arm == baseline else difference(values, of_baseline)
+            cells.append(f"{mean_and_error(values)}{gain}, {len(values)} seeds, {seconds[task, arm] / 60:.1f} min")
             pair = values, of_baseline
             if min(values.mean(), of_baseline.mean()) <= 0:
                 continue  # a ratio would say nothing
