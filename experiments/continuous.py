@@ -5,6 +5,7 @@ earlier agent that EqRSAC equals to rounding, but for the spread of the first re
 
     python -m experiments.continuous train runs/continuous --tasks Ant-v5 --arms sac none --seeds 0
     python -m experiments.continuous train runs/short --short --tasks HalfCheetah-v5 --arms sac none --seeds 100
+    python -m experiments.continuous time
     python -m experiments.continuous report docs/results/continuous_gate.xz
 """
 
@@ -152,6 +153,22 @@ def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds
         print(task, arm, seed, round(area(run)), f"{run['seconds']} s", flush=True)
 
 
+def time_updates(task: str, arms: Sequence[str], rounds: int) -> str:
+    """Milliseconds of an update of each arm, which take turns: medians over rounds, and of the ratios to the first arm."""
+    agents, n_updates = [make_agent(arm, task, 0, False) for arm in arms], 30
+    for agent in agents:
+        agent.learning_starts = 1_000
+        agent.learn(1_001)
+    times = np.empty((rounds, len(arms)))
+    for i, k in np.ndindex(times.shape):
+        started = time.perf_counter()
+        agents[k].train(n_updates, agents[k].batch_size)
+        times[i, k] = (time.perf_counter() - started) / n_updates * 1_000
+    milliseconds, ratios = np.median(times, axis=0), np.median(times / times[:, :1], axis=0)
+    table = [[arm, f"{time:.1f}", f"{ratio:.2f}"] for arm, time, ratio in zip(arms, milliseconds, ratios, strict=True)]
+    return markdown(["arm", "ms per update", f"times {arms[0]}"], table)
+
+
 def area(run: dict[str, Any], after: int = 0, until: float = np.inf) -> float:
     """The mean return of the episodes that end after one step and until another: each weighs as many steps as it has."""
     steps, scores, lengths = (np.array(run["training"][key]) for key in ("step", "score", "length"))
@@ -231,6 +248,10 @@ def main() -> None:
     running.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
+    timing = commands.add_parser("time", help="compare the time of an update")
+    timing.add_argument("--task", default=TASKS[0])
+    timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
+    timing.add_argument("--rounds", type=int, default=10)
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
     reporting.add_argument(
@@ -244,6 +265,9 @@ def main() -> None:
     if args.command == "train":
         args.folder.mkdir(parents=True, exist_ok=True)
         train(args.folder, args.tasks, args.arms, args.seeds, args.short)
+        return
+    if args.command == "time":
+        print(time_updates(args.task, args.arms, args.rounds))
         return
     runs = read(args.paths)
     if args.pack is not None:
