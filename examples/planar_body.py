@@ -37,7 +37,7 @@ def train(path: pathlib.Path, seed: int) -> EqRSAC:
         return EqRSAC.load(path, device="cpu")
     model = EqRSAC(
         "MlpPolicy", ENV_ID, learning_rate=1e-3, batch_size=64, learning_starts=1_000, buffer_size=N_STEPS, seed=seed,
-        policy_kwargs=KWARGS, device="cpu",
+        prediction_depth=2, policy_kwargs=KWARGS, device="cpu",
     )  # fmt: skip
     model.learn(N_STEPS)
     model.save(path)

@@ -13,6 +13,7 @@ import argparse
 import json
 import lzma
 import pathlib
+import shutil
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -29,36 +30,34 @@ from torch import nn
 
 from experiments import markdown
 from experiments.tables import PARTS, difference, draw, mean_and_error
-from sb3_eqr import EqRSAC
+from sb3_eqr import EqRSAC, ExactCheckpointCallback
+from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 
 PIXELS, N_TORQUES = "PixelPendulum-v0", 201
 NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
 COMPARED = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5"]
 TASKS = [*COMPARED, "HalfCheetah-v5+noise", PIXELS]
-N_STEPS, N_SHORT, N_RANDOM_SHORT = 100_000, 12_000, 2_000
+N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN = 100_000, 12_000, 2_000, 10_000
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
-NONE: dict[str, Any] = {"group": "none(72)", "n_blocks": 1}  # as many numbers as SE(2)^12
-NARROW: dict[str, Any] = {
-    "reads_features": False,
-    "latent_hidden_dim": 128,
-    "features_extractor_kwargs": {"features_dim": 128},
-}
+# The agent of the gate, older than the defaults; as many numbers as SE(2)^12.
+WIDE: dict[str, Any] = {"latent_hidden_dim": 256, "features_extractor_kwargs": {"features_dim": 256}, "reads_features": True}
 OF_SAC: dict[str, dict[str, Any]] = {"sac": {}, "sac_layer_norm": {}, "sac_two_updates": {"gradient_steps": 2}}
-# name -> arguments of SAC, or of EqRSAC
+# name -> arguments of SAC, or of EqRSAC, whose defaults are those of "narrow"
 ARMS: dict[str, dict[str, Any]] = {
     **OF_SAC,
-    "se2": {"policy_kwargs": {"group": "SE(2)", "n_blocks": 12}},
-    "none": {"policy_kwargs": NONE},
-    "no_losses": {"policy_kwargs": NONE, "prediction_depth": 0},
-    "no_features": {"policy_kwargs": {**NONE, "reads_features": False}},
-    "one_step": {"policy_kwargs": NONE, "prediction_depth": 1},
-    "five_steps": {"policy_kwargs": NONE, "prediction_depth": 5},
-    "cheaper": {"policy_kwargs": {**NONE, "reads_features": False}, "prediction_depth": 1},
-    "narrow": {"policy_kwargs": {**NONE, **NARROW}, "prediction_depth": 1},
-    "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
+    "narrow": {},
+    "narrow_se2": {"policy_kwargs": {"group": "SE(2)"}},
+    "no_losses": {"prediction_depth": 0},
+    "small": {"policy_kwargs": {"group": "none(32)"}},
+    "none": {"policy_kwargs": WIDE, "prediction_depth": 2},
+    "se2": {"policy_kwargs": {**WIDE, "group": "SE(2)"}, "prediction_depth": 2},
+    "no_features": {"policy_kwargs": {**WIDE, "reads_features": False}, "prediction_depth": 2},
+    "one_step": {"policy_kwargs": WIDE, "prediction_depth": 1},
+    "five_steps": {"policy_kwargs": WIDE, "prediction_depth": 5},
+    "cheaper": {"policy_kwargs": {**WIDE, "reads_features": False}, "prediction_depth": 1},
 }
 
 
@@ -83,18 +82,22 @@ class LayerNormPolicy(SACPolicy):
 
 
 class Episodes(BaseCallback):
-    """Collect the step, return and length of each training episode."""
+    """Collect the step, return and length of each training episode, and the CPU seconds, as attributes of the model."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: dict[str, list[float]] = {"step": [], "score": [], "length": []}
+    model: Any
+
+    def _on_training_start(self) -> None:
+        if not hasattr(self.model, "episodes"):
+            self.model.episodes, self.model.seconds = {"step": [], "score": [], "length": []}, 0.0
+        self._start = time.process_time() - self.model.seconds  # those of a run that was resumed count
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if "episode" in info:
-                self.found["step"].append(self.num_timesteps)
-                self.found["score"].append(info["episode"]["r"])
-                self.found["length"].append(info["episode"]["l"])
+                episode = {"step": self.num_timesteps, "score": info["episode"]["r"], "length": info["episode"]["l"]}
+                for name, value in episode.items():
+                    self.model.episodes[name].append(round(float(value), 2))
+        self.model.seconds = time.process_time() - self._start
         return True
 
 
@@ -137,36 +140,42 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC:
 
 
 def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool) -> None:
-    """Run what is not in the folder, seed by seed, task by task, arm by arm."""
+    """Run what is not in the folder, seed by seed, task by task, arm by arm. EqRSAC's runs can be stopped at any time."""
     steps = N_SHORT if is_short else N_STEPS
     for seed, task, arm in ((seed, task, arm) for seed in seeds for task in tasks for arm in arms):
         file = folder / f"{arm}-{task}-{seed}.json"
         if file.exists():
             continue
-        started, episodes = time.process_time(), Episodes()
-        make_agent(arm, task, seed, is_short).learn(steps, callback=episodes)
-        run = {"arm": arm, "task": task, "seed": seed, "steps": steps, "seconds": round(time.process_time() - started)}
-        found = {name: [round(float(value), 2) for value in values] for name, values in episodes.found.items()}
-        run = {**run, "torch": th.__version__, "training": found}
+        model: Any = make_agent(arm, task, seed, is_short)
+        callbacks: list[BaseCallback] = [Episodes()]
+        if isinstance(model, EqRSAC):
+            checkpoints = file.with_suffix("")
+            if find_checkpoints(checkpoints):
+                model = EqRSAC.resume(checkpoints, make_env(task), device="cpu")
+            callbacks.append(ExactCheckpointCallback(N_BETWEEN, checkpoints, keep=1))
+        model.learn(steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=model.num_timesteps == 0)
+        run = {"arm": arm, "task": task, "seed": seed, "steps": steps, "seconds": round(model.seconds)}
+        run = {**run, "torch": th.__version__, "training": model.episodes}
         with atomic_write(file, "json") as out:
             out.write(json.dumps(run).encode())
+        shutil.rmtree(file.with_suffix(""), ignore_errors=True)
         print(task, arm, seed, round(area(run)), f"{run['seconds']} s", flush=True)
 
 
-def time_updates(task: str, arms: Sequence[str], rounds: int) -> str:
-    """Milliseconds of an update of each arm, which take turns: medians over rounds, and of the ratios to the first arm."""
-    agents, n_updates = [make_agent(arm, task, 0, False) for arm in arms], 30
+def time_steps(task: str, arms: Sequence[str], rounds: int) -> str:
+    """Milliseconds of a step of learning of each arm, in turns: medians over rounds, and of the ratios to the first arm."""
+    agents, n_steps = [make_agent(arm, task, 0, False) for arm in arms], 100
     for agent in agents:
         agent.learning_starts = 1_000
-        agent.learn(1_001)
+        agent.learn(1_100)
     times = np.empty((rounds, len(arms)))
     for i, k in np.ndindex(times.shape):
         started = time.perf_counter()
-        agents[k].train(n_updates, agents[k].batch_size)
-        times[i, k] = (time.perf_counter() - started) / n_updates * 1_000
+        agents[k].learn(n_steps, reset_num_timesteps=False)
+        times[i, k] = (time.perf_counter() - started) / n_steps * 1_000
     milliseconds, ratios = np.median(times, axis=0), np.median(times / times[:, :1], axis=0)
     table = [[arm, f"{time:.1f}", f"{ratio:.2f}"] for arm, time, ratio in zip(arms, milliseconds, ratios, strict=True)]
-    return markdown(["arm", "ms per update", f"times {arms[0]}"], table)
+    return markdown(["arm", "ms per step", f"times {arms[0]}"], table)
 
 
 def area(run: dict[str, Any], after: int = 0, until: float = np.inf) -> float:
@@ -188,16 +197,15 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
     return runs
 
 
-def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, is_timed: bool) -> str:
+def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, cost: float) -> str:
     """
     Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
-    over tasks, bootstrap interval over seeds. If timed, each arm's area only until the step that it reaches in the time of the
-    baseline's whole run. Times are those of the fastest seed, since others had to share a core.
+    over tasks, bootstrap interval over seeds. The areas of all but the baseline end after 1 / ``cost`` of the steps.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
     for key, of_key in runs.items():
-        share = seconds.get((key[0], baseline), np.nan) / seconds[key] if is_timed else np.inf
+        share = 1.0 if key[1] == baseline else 1 / cost
         areas[key] = np.array([area(run, after, share * run["steps"]) for run in of_key.values()])
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
@@ -248,7 +256,7 @@ def main() -> None:
     running.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
-    timing = commands.add_parser("time", help="compare the time of an update")
+    timing = commands.add_parser("time", help="compare the time of a step of learning")
     timing.add_argument("--task", default=TASKS[0])
     timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
     timing.add_argument("--rounds", type=int, default=10)
@@ -259,7 +267,9 @@ def main() -> None:
     )
     reporting.add_argument("--to", default="sac", choices=list(ARMS), help="the arm whose area is 1")
     reporting.add_argument("--after", type=int, default=0, help="count episodes that end after this step")
-    reporting.add_argument("--equal-time", action="store_true", help="no steps beyond the time of that arm's run")
+    reporting.add_argument(
+        "--cost", type=float, default=1.0, help="compare in the same time, if a step takes so many times as long as that arm's"
+    )
     reporting.add_argument("--pack", type=pathlib.Path, help="also write all runs into this file, packed by xz")
     args = parser.parse_args()
     if args.command == "train":
@@ -267,7 +277,7 @@ def main() -> None:
         train(args.folder, args.tasks, args.arms, args.seeds, args.short)
         return
     if args.command == "time":
-        print(time_updates(args.task, args.arms, args.rounds))
+        print(time_steps(args.task, args.arms, args.rounds))
         return
     runs = read(args.paths)
     if args.pack is not None:
@@ -276,7 +286,7 @@ def main() -> None:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
         draw(rows(runs, ["none", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
-    print(report(runs, args.to, args.after, args.equal_time))
+    print(report(runs, args.to, args.after, args.cost))
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class LatentHeadPolicy(EqRQRDQNPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         space, options = self.observation_space, self.options
-        self.apart = make_trunk(TwoLayerExtractor, space, {}, True, False)
+        self.apart = make_trunk(TwoLayerExtractor, space, {"features_dim": 256}, True, False)
         layer = GroupLayer(self.apart.features_dim, options.group or "none", options.n_blocks)
         self.trained = LatentModel(layer, layer.group, layer.n_blocks, int(self.action_space.n), options)
         averages = frozen_copy(self.apart), frozen_copy(self.trained)

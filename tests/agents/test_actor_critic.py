@@ -62,7 +62,8 @@ DICT = spaces.Dict({"image": IMAGE, "place": BOX})
 
 def make(agent, env=None, policy="MlpPolicy", **kwargs):
     policy_kwargs = {**NETWORK, **kwargs.pop("policy_kwargs", {})}
-    return agent(policy, MoveEnv() if env is None else env, **{**SMALL, **kwargs}, policy_kwargs=policy_kwargs)
+    given = {"prediction_depth": 2, **SMALL, **kwargs}
+    return agent(policy, MoveEnv() if env is None else env, **given, policy_kwargs=policy_kwargs)
 
 
 @PAIRS
@@ -104,14 +105,16 @@ def test_the_default_latent_state_has_as_many_numbers_as_twelve_blocks_of_se2(ag
 
 
 @EACH
-def test_actor_and_critics_read_the_moving_average(agent):
-    model = make(agent).learn(60)
+@pytest.mark.parametrize("reads_features", [None, True])
+def test_actor_and_critics_read_the_moving_average(agent, reads_features):
+    model = make(agent, policy_kwargs={"reads_features": reads_features}).learn(60)
     policy, observation = model.policy, th.rand(5, 3)
     policy.set_training_mode(False)
     features = policy.latent_encoder(observation)
     state = policy.latent_target.embedding(features)  # (5, 18)
     read = policy.actor.extract_features(observation, policy.actor.features_extractor)
-    assert th.equal(read, th.cat([observation, features, state], dim=1)) and not read.requires_grad
+    parts = [observation, features, state] if reads_features else [observation, state]
+    assert th.equal(read, th.cat(parts, dim=1)) and not read.requires_grad
     action = th.rand(5, 2)
     element = policy.latent_target.group.element(
         policy.latent_target.transition(th.cat([state, action], dim=1)).view(5, 3, 3)
@@ -134,7 +137,7 @@ def test_the_gradient_for_the_action_passes_the_latent_model(agent):
     policy = model.policy.double()
     critic, observation, action = policy.critic, th.rand(4, 3, dtype=th.float64), th.rand(4, 2, dtype=th.float64)
     features = policy.latent_encoder(observation)
-    read = th.cat([observation, features, policy.latent_target.embedding(features)], dim=1)
+    read = th.cat([observation, policy.latent_target.embedding(features)], dim=1)
     critic.features_extractor.forward = lambda obs: read  # as SB3 converts observations to float32
     action.requires_grad_()
 
