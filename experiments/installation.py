@@ -23,7 +23,7 @@ TRAIN, RUN = "sb3-eqr train --algo eqr_qrdqn --env", "sb3-eqr benchmark run"
 COMMANDS = (
     f"{TRAIN} CartPole-v1 --eval-freq 5000 -n 3000 --eval-freq 1500 --eval-episodes 2",
     "sb3-eqr enjoy --algo eqr_qrdqn --env CartPole-v1 -f logs --no-render -n 200",
-    "sb3-eqr visualize half_cheetah.zip --env HalfCheetah-v5",
+    "sb3-eqr visualize ball.zip --env SlidingBallDistractors-v0",
     f"{RUN} results/first --suite smoke --agents eqr_qrdqn:off eqr_qrdqn qrdqn:stock --seeds 2 --steps 500",
     "sb3-eqr benchmark report results/first",
 )

@@ -47,8 +47,9 @@ class Diagnostics(NamedTuple):
     def summary(self) -> str:
         """The verdict in one sentence, and what to do in a second one."""
         (skill, gain), (latent_skill, latent_gain) = skill_and_gain(self.loss), skill_and_gain(self.transition)
+        steps = "one step" if len(self.loss.error) == 1 else f"{len(self.loss.error)} steps"
         errors = (
-            f"over {len(self.loss.error)} steps, its error is {_lower(skill)} than with shuffled targets and {_lower(gain)} "
+            f"over {steps}, its error is {_lower(skill)} than with shuffled targets and {_lower(gain)} "
             f"than when standing still ({_lower(latent_skill)} and {_lower(latent_gain)} between latent states, before the "
             "projection)"
         )
