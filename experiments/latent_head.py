@@ -10,7 +10,6 @@ import argparse
 import json
 import lzma
 import pathlib
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -113,9 +112,8 @@ def train(file: pathlib.Path, tasks: list[str], arms: list[str], seeds: list[int
     for seed, task, arm in ((seed, task, arm) for seed in seeds for task in tasks for arm in arms):
         if (task, arm, seed) in done:
             continue
-        model, episodes, started = make(task, arm, seed), Episodes(), time.process_time()
-        model.learn(STEPS[task], callback=episodes)
-        seconds = round(time.process_time() - started)
+        model: Any = make(task, arm, seed)
+        model.learn(STEPS[task], callback=Episodes())
         score: Any
         score, _ = evaluate_policy(model, make_vec_env(task, 10, seed=10_000 + seed), 50)
         run = {
@@ -123,12 +121,12 @@ def train(file: pathlib.Path, tasks: list[str], arms: list[str], seeds: list[int
             "arm": arm,
             "seed": seed,
             "score": float(score),
-            "cpu_seconds": seconds,
-            "training": episodes.found,
+            "cpu_seconds": round(model.seconds),
+            "training": model.episodes,
         }
         with file.open("a") as out:
             out.write(json.dumps(run) + "\n")
-        print(task, arm, seed, f"score {score:.1f}, in training {area(run):.1f}, {seconds} s", flush=True)
+        print(task, arm, seed, f"score {score:.1f}, in training {area(run):.1f}, {run['cpu_seconds']} s", flush=True)
 
 
 def read(file: pathlib.Path) -> list[dict[str, Any]]:
