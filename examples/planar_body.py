@@ -2,7 +2,7 @@
 What EqRSAC's latent state learns about a body in the plane, driven by commands in its own frame: whether blocks of SE(2) turn
 by the angle by which the body turns.
 
-    python examples/planar_body.py                   # one seed, five minutes on an idle core
+    python examples/planar_body.py                   # one seed, two minutes on an idle core
     python examples/planar_body.py --seeds 0 1 2
 
 Writes a model per seed and a figure to --out, and prints a table. Finished seeds are not trained again.
