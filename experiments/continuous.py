@@ -50,6 +50,8 @@ ARMS: dict[str, dict[str, Any]] = {
     **OF_SAC,
     "narrow": {},
     "narrow_se2": {"policy_kwargs": {"group": "SE(2)"}},
+    "narrow_two_steps": {"prediction_depth": 2},
+    "narrow_no_predictor": {"policy_kwargs": {"predictor": False}},
     "no_losses": {"prediction_depth": 0},
     "small": {"policy_kwargs": {"group": "none(32)"}},
     "none": {"policy_kwargs": WIDE, "prediction_depth": 2},
