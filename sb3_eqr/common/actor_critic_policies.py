@@ -75,6 +75,11 @@ class ActorCriticOptions(LatentOptions):
     projection: str = option("own", one_of(["own", "none"]))
 
     def __post_init__(self) -> None:
+        if self.group is None:
+            raise ValueError(
+                'group must be a string or a group, got None. Pass "none(72)" for an unconstrained latent state, or, for SAC '
+                'itself, prediction_depth=0 and policy_kwargs=dict(head_input="observation").'
+            )
         super().__post_init__()
         if isinstance(self.group, str) and self.group.startswith("none"):
             if self.n_blocks not in (None, 1):

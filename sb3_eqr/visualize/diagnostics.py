@@ -14,10 +14,10 @@ from sb3_eqr.visualize.measures import Rewards, Transition, mean_of_known
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
-    "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show: "
-    "docs/faq.md.",
+    "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
-    "than both. Train longer, with aet_coef above 0. If that does not help, transition.csv shows at which step it fails.",
+    "than both. Train longer, with aet_coef above 0. Where a step moves the state little, no motion is hard to beat: "
+    "policy_kwargs=dict(predictor=False) predicts more closely. The verdict does not say whether returns improve.",
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
@@ -144,4 +144,8 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _lower(share: float) -> str:
-    return "no lower" if np.isnan(share) else f"{share:.0%} lower" if share >= 0 else f"{-share:.0%} higher"
+    if np.isnan(share):
+        return "no lower"
+    if share < -1:
+        return f"{1 - share:.3g} times higher"
+    return f"{share:.0%} lower" if share >= 0 else f"{-share:.0%} higher"

@@ -65,7 +65,9 @@ SETTINGS = [
 
 
 def test_the_table_is_the_one_that_is_tested():
-    rows = re.findall(r"^\| (?!what|-)(.*) \| (yes|no)(?:; yes with [^|]*)? \|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (?!what|-)(.*) \| (yes|no)(?:; yes with [^|]*)? \|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert [answer for _, answer in rows] == "no no no yes yes yes".split()
 
 
