@@ -164,9 +164,9 @@ def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds
         print(task, arm, seed, round(area(run)), f"{run['seconds']} s", flush=True)
 
 
-def time_steps(task: str, arms: Sequence[str], rounds: int) -> str:
+def time_steps(task: str, arms: Sequence[str], rounds: int, is_short: bool) -> str:
     """Milliseconds of a step of learning of each arm, in turns: medians over rounds, and of the ratios to the first arm."""
-    agents, n_steps = [make_agent(arm, task, 0, False) for arm in arms], 100
+    agents, n_steps = [make_agent(arm, task, 0, is_short) for arm in arms], 100
     for agent in agents:
         agent.learning_starts = 1_000
         agent.learn(1_100)
@@ -262,6 +262,7 @@ def main() -> None:
     timing.add_argument("--task", default=TASKS[0])
     timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
     timing.add_argument("--rounds", type=int, default=10)
+    timing.add_argument("--short", action="store_true", help="with small networks")
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
     reporting.add_argument(
@@ -279,7 +280,7 @@ def main() -> None:
         train(args.folder, args.tasks, args.arms, args.seeds, args.short)
         return
     if args.command == "time":
-        print(time_steps(args.task, args.arms, args.rounds))
+        print(time_steps(args.task, args.arms, args.rounds, args.short))
         return
     runs = read(args.paths)
     if args.pack is not None:
