@@ -15,7 +15,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
-# The pictures of the README, in less than four minutes on two idle cores; `make demo GAME=Boxing` is a game of Atari.
+# The pictures of the README, in less than five minutes on two idle cores; `make demo GAME=Boxing` is a game of Atari.
 demo: $(VENV)/installed
 ifeq ($(GAME),)
 	$(DEMO) examples/sliding_ball.py --out demo_results/ball

@@ -1,7 +1,7 @@
 """
 The README's picture: SAC with a latent model and without it on HalfCheetah, both at once.
 
-    python examples/half_cheetah.py    # about two minutes on two idle cores
+    python examples/half_cheetah.py    # about four minutes on two idle cores
 
 Writes both models and demo.gif to --out. In the picture's left half the two trained agents run, drawn from the positions of
 their bodies, so that no renderer is needed. The right half shows their returns while they learned, over the range of the
@@ -39,10 +39,10 @@ SETTINGS: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [128, 128]},
 }
 ROWS = pathlib.Path(__file__).parents[1] / "docs" / "results" / "continuous_short.xz"
-OF_ROWS = {"EqRSAC": "narrow", "SAC": "sac"}
+OF_ROWS = {"EqRSAC": "none", "SAC": "sac"}
 N_FRAMES, STEPS_PER_FRAME, FPS = 80, 2, 10  # of 0.05 s each: the film is as fast as the simulation
 HALF_WIDTH, HEIGHT = 2.2, 1.5  # of the view, metres
-SEED = 101  # of the five seeds kept of both, the one whose difference is nearest to their mean
+SEED = 105  # of the six seeds kept of both, the one whose difference is nearest to their mean
 
 
 class Run(NamedTuple):

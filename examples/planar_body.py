@@ -2,7 +2,7 @@
 What EqRSAC's latent state learns about a body in the plane, driven by commands in its own frame: whether blocks of SE(2) turn
 by the angle by which the body turns.
 
-    python examples/planar_body.py                   # one seed, two minutes on an idle core
+    python examples/planar_body.py                   # one seed, four minutes on an idle core
     python examples/planar_body.py --seeds 0 1 2
 
 Writes a model per seed and a figure to --out, and prints a table. Finished seeds are not trained again.
@@ -37,7 +37,7 @@ def train(path: pathlib.Path, seed: int) -> EqRSAC:
         return EqRSAC.load(path, device="cpu")
     model = EqRSAC(
         "MlpPolicy", ENV_ID, learning_rate=1e-3, batch_size=64, learning_starts=1_000, buffer_size=N_STEPS, seed=seed,
-        prediction_depth=2, policy_kwargs=KWARGS, device="cpu",
+        policy_kwargs=KWARGS, device="cpu",
     )  # fmt: skip
     model.learn(N_STEPS)
     model.save(path)

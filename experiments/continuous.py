@@ -42,24 +42,27 @@ N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN = 100_000, 12_000, 2_000, 10_000
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
-# The agent of the gate, older than the defaults; as many numbers as SE(2)^12.
-WIDE: dict[str, Any] = {"latent_hidden_dim": 256, "features_extractor_kwargs": {"features_dim": 256}, "reads_features": True}
+NARROW: dict[str, Any] = {
+    "reads_features": False,
+    "latent_hidden_dim": 128,
+    "features_extractor_kwargs": {"features_dim": 128},
+}
 OF_SAC: dict[str, dict[str, Any]] = {"sac": {}, "sac_layer_norm": {}, "sac_two_updates": {"gradient_steps": 2}}
-# name -> arguments of SAC, or of EqRSAC, whose defaults are those of "narrow"
+# name -> arguments of SAC, or of EqRSAC, whose defaults are those of "none"
 ARMS: dict[str, dict[str, Any]] = {
     **OF_SAC,
-    "narrow": {},
-    "narrow_se2": {"policy_kwargs": {"group": "SE(2)"}},
-    "narrow_two_steps": {"prediction_depth": 2},
-    "narrow_no_predictor": {"policy_kwargs": {"predictor": False}},
+    "none": {},
+    "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
     "no_losses": {"prediction_depth": 0},
-    "small": {"policy_kwargs": {"group": "none(32)"}},
-    "none": {"policy_kwargs": WIDE, "prediction_depth": 2},
-    "se2": {"policy_kwargs": {**WIDE, "group": "SE(2)"}, "prediction_depth": 2},
-    "no_features": {"policy_kwargs": {**WIDE, "reads_features": False}, "prediction_depth": 2},
-    "one_step": {"policy_kwargs": WIDE, "prediction_depth": 1},
-    "five_steps": {"policy_kwargs": WIDE, "prediction_depth": 5},
-    "cheaper": {"policy_kwargs": {**WIDE, "reads_features": False}, "prediction_depth": 1},
+    "no_features": {"policy_kwargs": {"reads_features": False}},
+    "one_step": {"prediction_depth": 1},
+    "five_steps": {"prediction_depth": 5},
+    "cheaper": {"policy_kwargs": {"reads_features": False}, "prediction_depth": 1},
+    "narrow": {"policy_kwargs": NARROW, "prediction_depth": 1},
+    "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
+    "narrow_se2": {"policy_kwargs": {**NARROW, "group": "SE(2)"}, "prediction_depth": 1},
+    "narrow_two_steps": {"policy_kwargs": NARROW},
+    "narrow_no_predictor": {"policy_kwargs": {**NARROW, "predictor": False}, "prediction_depth": 1},
 }
 
 

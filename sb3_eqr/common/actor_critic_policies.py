@@ -16,7 +16,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_eqr.common.checks.arguments import (
     ALGORITHM,
     FLAG,
-    NONE,
     POLICY,
     SHARE,
     TEXT,
@@ -56,7 +55,7 @@ RULES = {
     "net_arch": POLICY["net_arch"] | NET_ARCH,
     "n_critics": integer(1),
     "head_input": one_of(["latent", "observation"]),
-    "reads_features": FLAG | NONE,
+    "reads_features": FLAG,
     "shift_pixels": ALGORITHM["shift_pixels"],
 }
 
@@ -70,7 +69,6 @@ class ActorCriticOptions(LatentOptions):
 
     group: str | Group = option("none(72)", GROUP)  # type: ignore[assignment]  # noqa: RUF009
     transition: str = option("group", one_of(["group"]))
-    latent_hidden_dim: int = option(128, integer(1))
     latent_tau: float | None = option(0.005, SHARE)
     projection: str = option("own", one_of(["own", "none"]))
 
@@ -96,7 +94,7 @@ class ActorCriticOptions(LatentOptions):
 
 class LatentReader(BaseFeaturesExtractor):
     """
-    What actor and critics read of observations: [s, x] of vectors, [h(s), x] of all others.
+    What actor and critics read of observations: [s, h(s), x] of vectors, [h(s), x] of all others, or the same without h(s).
     h and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In train mode,
     observations are augmented; in a round of updates, those of one batch are encoded only once, for actor and critics alike.
 
@@ -104,7 +102,7 @@ class LatentReader(BaseFeaturesExtractor):
     :param encoder: the moving average of the encoder, h
     :param latent_model: the moving average of the latent model
     :param augment: in train mode; otherwise observations are only preprocessed
-    :param reads_features: whether h(s) is among what they read; ``None``: unless observations are vectors
+    :param reads_features: whether h(s) is among what they read
     """
 
     def __init__(
@@ -113,12 +111,12 @@ class LatentReader(BaseFeaturesExtractor):
         encoder: BaseFeaturesExtractor,
         latent_model: LatentModel,
         augment: Augmentation,
-        reads_features: bool | None = None,
+        reads_features: bool = True,
     ):
         self.is_vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
         n_observed = observation_space.shape[0] if self.is_vector else 0  # type: ignore[index]
-        self.reads_features = not self.is_vector if reads_features is None else reads_features
-        n_features = encoder.features_dim if self.reads_features else 0
+        self.reads_features = reads_features
+        n_features = encoder.features_dim if reads_features else 0
         super().__init__(observation_space, n_observed + n_features + latent_model.state_dim)
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
         self._augment = augment
@@ -212,7 +210,7 @@ class EqRActorCriticPolicy(BasePolicy):
         ``head_input="observation"``
     :param features_extractor_kwargs: its keyword arguments
     :param layer_norm: whether layer norm follows the encoder
-    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s. ``None``: unless s is a vector
+    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
     :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
         (https://arxiv.org/abs/2004.13649)
@@ -243,7 +241,7 @@ class EqRActorCriticPolicy(BasePolicy):
         features_extractor_kwargs: dict[str, Any] | None = None,
         layer_norm: bool = True,
         head_input: str = "latent",
-        reads_features: bool | None = None,
+        reads_features: bool = True,
         shift_pixels: int = 4,
         **kwargs: Any,
     ):

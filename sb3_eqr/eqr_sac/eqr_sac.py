@@ -54,7 +54,7 @@ class EqRSAC(EqRActorCritic, SAC):
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
-        prediction_depth: int = 1,
+        prediction_depth: int = 2,
         aet_coef: float = 1.0,
         symmetry_coef: float = 0.0,
         reward_coef: float = 1.0,

@@ -105,7 +105,7 @@ def test_the_default_latent_state_has_as_many_numbers_as_twelve_blocks_of_se2(ag
 
 
 @EACH
-@pytest.mark.parametrize("reads_features", [None, True])
+@pytest.mark.parametrize("reads_features", [False, True])
 def test_actor_and_critics_read_the_moving_average(agent, reads_features):
     model = make(agent, policy_kwargs={"reads_features": reads_features}).learn(60)
     policy, observation = model.policy, th.rand(5, 3)
@@ -137,7 +137,7 @@ def test_the_gradient_for_the_action_passes_the_latent_model(agent):
     policy = model.policy.double()
     critic, observation, action = policy.critic, th.rand(4, 3, dtype=th.float64), th.rand(4, 2, dtype=th.float64)
     features = policy.latent_encoder(observation)
-    read = th.cat([observation, policy.latent_target.embedding(features)], dim=1)
+    read = th.cat([observation, features, policy.latent_target.embedding(features)], dim=1)
     critic.features_extractor.forward = lambda obs: read  # as SB3 converts observations to float32
     action.requires_grad_()
 

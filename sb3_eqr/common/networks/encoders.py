@@ -222,7 +222,7 @@ class TwoLayerExtractor(BaseFeaturesExtractor):
     :param features_dim: size of both layers
     """
 
-    def __init__(self, observation_space: spaces.Space, features_dim: int = 128):
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
         check("features_dim", features_dim, integer(1))
         super().__init__(observation_space, features_dim)
         flat = FlattenExtractor(observation_space)
