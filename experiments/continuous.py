@@ -60,9 +60,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "cheaper": {"policy_kwargs": {"reads_features": False}, "prediction_depth": 1},
     "narrow": {"policy_kwargs": NARROW, "prediction_depth": 1},
     "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
-    "narrow_se2": {"policy_kwargs": {**NARROW, "group": "SE(2)"}, "prediction_depth": 1},
     "narrow_two_steps": {"policy_kwargs": NARROW},
-    "narrow_no_predictor": {"policy_kwargs": {**NARROW, "predictor": False}, "prediction_depth": 1},
 }
 
 

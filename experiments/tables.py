@@ -249,11 +249,7 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
         lines = {str(line.get_label()): line for axis in axes.flat for line in axis.get_lines()}
         figure.supxlabel("training steps (thousands)", fontsize="medium")
         figure.supylabel(AXES.get(what, what), fontsize="medium")
-        handles = list(lines.values()), list(lines)
-        if len(games) < axes.size:
-            axes.flat[-1].legend(*handles, loc="center").set_in_layout(False)
-        else:
-            figure.legend(*handles, loc="outside upper center")
+        figure.legend(list(lines.values()), list(lines), loc="outside upper center")
         figure.savefig(path, dpi=DPI, metadata={"Software": None})
         plt.close(figure)
 

@@ -16,8 +16,8 @@ PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
     "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
-    "than both. Train longer, with aet_coef above 0. Where a step moves the state little, no motion is hard to beat: "
-    "policy_kwargs=dict(predictor=False) predicts more closely. The verdict does not say whether returns improve.",
+    "than both. Train longer, with aet_coef above 0. Where a step moves the state little, standing still is hard to beat. "
+    "The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "

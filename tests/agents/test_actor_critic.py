@@ -62,8 +62,7 @@ DICT = spaces.Dict({"image": IMAGE, "place": BOX})
 
 def make(agent, env=None, policy="MlpPolicy", **kwargs):
     policy_kwargs = {**NETWORK, **kwargs.pop("policy_kwargs", {})}
-    given = {"prediction_depth": 2, **SMALL, **kwargs}
-    return agent(policy, MoveEnv() if env is None else env, **given, policy_kwargs=policy_kwargs)
+    return agent(policy, MoveEnv() if env is None else env, **{**SMALL, **kwargs}, policy_kwargs=policy_kwargs)
 
 
 @PAIRS
