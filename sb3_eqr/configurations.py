@@ -44,7 +44,10 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.")
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
-        raise ValueError(f"env_id must be one of the entries {list(entries)} of configuration {name!r}, got {env_id!r}.")
+        default = ' Any other environment has the entry "default".' if "default" in entries else ""
+        raise ValueError(
+            f"env_id must be one of the entries {list(entries)} of configuration {name!r}, got {env_id!r}.{default}"
+        )
     if normalize := entries[env_id].get("normalize"):
         warnings.warn(
             f"configuration {name!r}, {env_id!r}: its agent is trained with normalize: {normalize}, not an argument of "

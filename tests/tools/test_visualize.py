@@ -186,7 +186,10 @@ def test_every_group(group):
     figure = latent_figure(model, encode(model, windows.samples.observations), windows.factors[:, 0], "angle")
     assert len(figure.axes) == n_blocks + 1  # including the colour bar
     if group in DRAWN:
-        assert {*all_pictures(found, ["0", "1"]), "latents"} == set(PICTURES)
+        of_groups = set() if inverse else {"motion", "generators"}
+        assert {*all_pictures(found, ["0", "1"]), "latents"} == set(PICTURES) - of_groups
+        unknown = found._replace(disentanglement=found.disentanglement._replace(information=None))
+        assert ("disentanglement" in all_pictures(unknown, ["0", "1"])) == (n_blocks > 1)
 
 
 def test_dict_observations_and_an_agent_without_latent_losses():
