@@ -157,6 +157,7 @@ def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds
                 model = EqRSAC.resume(checkpoints, make_env(task), device="cpu")
             callbacks.append(ExactCheckpointCallback(N_BETWEEN, checkpoints, keep=1))
         model.learn(steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=model.num_timesteps == 0)
+        model.save(file.with_suffix(".zip"))  # for sb3-eqr visualize
         run = {"arm": arm, "task": task, "seed": seed, "steps": steps, "seconds": round(model.seconds)}
         run = {**run, "torch": th.__version__, "training": model.episodes}
         with atomic_write(file, "json") as out:
