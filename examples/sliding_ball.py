@@ -143,7 +143,7 @@ def draw(model: EqRQRDQN, world: SlidingBall, path: pathlib.Path) -> None:
     n_blocks, axes = model.policy.latent_model.n_blocks, world.dimensions
     with styled():
         figure, panels = plt.subplots(
-            axes, n_blocks + 1, figsize=(2 * n_blocks + 2, 2.2 * axes), squeeze=False, layout="constrained"
+            axes, n_blocks + 1, figsize=(1.45 * n_blocks + 1.45, 1.65 * axes), squeeze=False, layout="constrained"
         )
         for axis in range(axes):
             along = np.full((GRID["ball"], axes), 0.5)
@@ -153,7 +153,7 @@ def draw(model: EqRQRDQN, world: SlidingBall, path: pathlib.Path) -> None:
             eight = 2 * np.pi * turns(model, encode(model, images(world, every)))
             shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (1, 1), (1, 1)), constant_values=120)  # (8, h, w)
             panels[axis, 0].imshow(np.block([list(shown[:4]), list(shown[4:])]), cmap="gray")
-            panels[axis, 0].set_title(f"{AXES[axis]} motion,\npositions 0 to 3, 4 to 7")
+            panels[axis, 0].set_title(f"{AXES[axis]} motion,\n0 to 3, 4 to 7")
             panels[axis, 0].set_axis_off()
             for k in range(n_blocks):
                 panel = panels[axis, k + 1]
