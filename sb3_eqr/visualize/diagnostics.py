@@ -32,7 +32,7 @@ class Diagnostics(NamedTuple):
 
     blocks: list[str]  # (K,): "SE(2) 0", ...
     transition: Transition  # in the latent space
-    loss: Transition  # the same between p(x̂_m) and p(x_m) on the unit sphere: the distance of Eq. 18, which training uses
+    loss: Transition  # the same between p(x̂_m), followed by the predictor, and p(x_m) on the unit sphere, as in training (Eq. 18)
     motion: findings.Motion
     generators: list[findings.Generators]  # one per group
     disentanglement: findings.Disentanglement
@@ -86,9 +86,10 @@ def diagnose(model: EqROffPolicy, play: Play, seed: int = 0) -> Diagnostics:
     """
     check_agent("diagnose", model)
     data = latents(model, play.samples)
-    compared = (data.states, data.next_states, data.predicted)
+    latent_model = model.policy.latent_model
     with th.no_grad(), eval_mode(model):
-        start, following, predicted = (F.normalize(model.policy.latent_model.project(x), dim=-1) for x in compared)
+        start, following = (F.normalize(latent_model.projection(x), dim=-1) for x in (data.states, data.next_states))
+        predicted = F.normalize(latent_model.project(data.predicted), dim=-1)  # which includes the predictor, if there is one
     chosen = th.linspace(0, len(data.states) - 1, min(len(data.states), MAX_STATES)).long().to(data.states.device)
     elements = action_elements(model, data.states[chosen])  # (n, A, D)
     motion = findings.find_motion(model, data, data.states[chosen], elements)
@@ -97,7 +98,7 @@ def diagnose(model: EqROffPolicy, play: Play, seed: int = 0) -> Diagnostics:
     signed = model.policy.options.reward_loss == "categorical"
     return Diagnostics(
         blocks=[name for name, *_ in each_block(model, data.states)],
-        transition=measures.transition_error(*compared, data.mask),
+        transition=measures.transition_error(data.states, data.next_states, data.predicted, data.mask),
         loss=loss,
         motion=motion,
         generators=generators,

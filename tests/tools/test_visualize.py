@@ -105,9 +105,9 @@ def test_three_agents_three_verdicts(trained):
     assert np.isnan(found[2].loss.skill).all() and found[2].summary.startswith("The latent states have collapsed")
 
 
-def by_hand():
+def by_hand(**network):
     """x = R(angle), κ(x, a) = R(±0.4), ρ = 1, r = 0, which is exact for unwound angles."""
-    model = make_model(env=Ring(unwound=True), n_blocks=1, network=PAPER_FLAT)
+    model = make_model(env=Ring(unwound=True), n_blocks=1, network={**PAPER_FLAT, **network})
     latent = model.policy.latent_model
     with th.no_grad():
         to_algebra = model.policy.group_layer.to_algebra
@@ -139,6 +139,16 @@ def test_an_exact_model_has_exact_metrics():
     assert found.collapse.effective_rank == pytest.approx(2, abs=0.1)  # a circle
     assert found.collapse.dead_units == found.collapse.dormant_units == 0.5  # the observation that is always 0
     assert np.allclose(found.rewards.explained, 0, atol=1e-6)
+
+
+def test_only_predictions_pass_the_predictor():
+    """A predictor of −1 turns the exact predictions around, ‖−u − u‖² = 4; true projections stay where they are."""
+    model = by_hand(projection="none")
+    model.policy.latent_model.predictor = th.nn.Linear(4, 4, bias=False)
+    model.policy.latent_model.predictor.weight.data.copy_(-th.eye(4))
+    found = look(model, n_steps=100, unwound=True)
+    assert np.allclose(found.loss.error, 4, rtol=1e-5) and (found.transition.error < 1e-9).all()
+    assert np.allclose(found.loss.still, found.transition.still / 2, rtol=1e-4)  # ‖x‖ = √2
 
 
 def test_constant_rewards_and_signs():
