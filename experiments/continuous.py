@@ -42,11 +42,8 @@ N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN = 100_000, 12_000, 2_000, 10_000
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
-NARROW: dict[str, Any] = {
-    "reads_features": False,
-    "latent_hidden_dim": 128,
-    "features_extractor_kwargs": {"features_dim": 128},
-}
+NARROW_READ: dict[str, Any] = {"latent_hidden_dim": 128, "features_extractor_kwargs": {"features_dim": 128}}
+NARROW = {**NARROW_READ, "reads_features": False}
 OF_SAC: dict[str, dict[str, Any]] = {"sac": {}, "sac_layer_norm": {}, "sac_two_updates": {"gradient_steps": 2}}
 # name -> arguments of SAC, or of EqRSAC, whose defaults are those of "none"
 ARMS: dict[str, dict[str, Any]] = {
@@ -61,6 +58,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "narrow": {"policy_kwargs": NARROW, "prediction_depth": 1},
     "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
     "narrow_two_steps": {"policy_kwargs": NARROW},
+    "narrow_read": {"policy_kwargs": NARROW_READ},
 }
 
 
