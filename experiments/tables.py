@@ -16,6 +16,8 @@ so that their letters can be read on a screen of 390 pixels.
 """
 
 import argparse
+import json
+import lzma
 import pathlib
 import re
 from collections.abc import Callable
@@ -54,7 +56,10 @@ OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
+SHORT = ("none", "sac"), "2000-12000", "continuous.md#with-distractors"  # small networks, after the random steps
 COMPARED: list[Arguments] = [
+    ("HalfCheetah, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5"], *SHORT),
+    ("HalfCheetah with noise, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5+noise"], *SHORT),
     ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
@@ -277,6 +282,15 @@ class Compared(NamedTuple):
         return better if self.ends[0] > 0 else worse if self.ends[1] < 0 else none
 
 
+def rows_of(path: pathlib.Path) -> list[Row]:
+    """The runs of a packed file of the benchmark, or of ``experiments.continuous``, whose arms and tasks are agents and games."""
+    if not path.name.startswith("continuous"):
+        return read(path)[1]
+    with lzma.open(path, "rt") as lines:
+        runs = [json.loads(line) for line in lines]
+    return [{**run, "agent": run["arm"], "game": run["task"], "protocol": {"steps": run["steps"]}} for run in runs]
+
+
 def compare(
     folder: pathlib.Path, task: str, files: list[str], games: list[str], agents: tuple[str, str], name: str, page: str
 ) -> Compared:
@@ -286,12 +300,12 @@ def compare(
     :param name: see :func:`measure`
     """
     both: list[np.ndarray] = []
-    runs = [read(folder / file) for file in files]
+    runs = [rows_of(folder / file) for file in files]
     for agent in agents:
-        found = {(r["seed"], r["game"]): r for _, rows in runs for r in rows if r["agent"] == agent and r["game"] in games}
+        found = {(r["seed"], r["game"]): r for rows in runs for r in rows if r["agent"] == agent and r["game"] in games}
         scores = pd.Series({run: measure(row, name) for run, row in found.items()}).unstack()[games]
         if len(games) > 1:
-            bounds = runs[0][0].normalisation.scores
+            bounds = read(folder / files[0])[0].normalisation.scores
             scores = scores.apply(lambda column, bounds=bounds: normalised(column, bounds[column.name]))
         both.append(scores.mean(axis=1).to_numpy())
     numbers, (low, high) = re.findall(r"\d+", name), ttest_ind(*both, equal_var=False).confidence_interval()
