@@ -283,7 +283,7 @@ class Compared(NamedTuple):
 
 
 def rows_of(path: pathlib.Path) -> list[Row]:
-    """The runs of a packed file of the benchmark, or of ``experiments.continuous``, whose arms and tasks are agents and games."""
+    """The runs of a packed file of the benchmark, or of ``experiments.continuous``: its arms are agents, its tasks games."""
     if not path.name.startswith("continuous"):
         return read(path)[1]
     with lzma.open(path, "rt") as lines:

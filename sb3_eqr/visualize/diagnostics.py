@@ -32,7 +32,7 @@ class Diagnostics(NamedTuple):
 
     blocks: list[str]  # (K,): "SE(2) 0", ...
     transition: Transition  # in the latent space
-    loss: Transition  # the same between p(x̂_m), followed by the predictor, and p(x_m) on the unit sphere, as in training (Eq. 18)
+    loss: Transition  # the same between p(x̂_m), past the predictor, and p(x_m) on the unit sphere, as in training (Eq. 18)
     motion: findings.Motion
     generators: list[findings.Generators]  # one per group
     disentanglement: findings.Disentanglement
