@@ -34,7 +34,7 @@ class EqRActorCritic(EqROffPolicy):
     """
 
     policy: EqRActorCriticPolicy
-    reward_scale = 1.0  # the standard deviation of the rewards in the replay buffer; saved with the model
+    reward_scale: float  # the standard deviation of the rewards in the replay buffer; saved with the model
 
     def __init__(
         self,

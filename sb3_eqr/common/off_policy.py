@@ -37,6 +37,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
     reward_coef: float
     policy_description: dict[str, str]
     frame_stack = 1
+    reward_scale = 1.0  # by which the reward network's targets are divided
     _monitor: UpdateMonitor
 
     @property

@@ -13,12 +13,11 @@ from sb3_eqr.common.checks.arguments import SuggestingParser
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
-from sb3_eqr.visualize.latents import Play, encode, names_of_factors, play
+from sb3_eqr.visualize.latents import DEPTH, Play, encode, names_of_factors, play
 from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictures
 from sb3_eqr.visualize.tables import all_tables, write_tables
 
-DEPTH = 5  # for agents without latent losses
 FLAGS = {"n_steps": "--steps", "depth": "--depth", "env": "--env"}  # argument of a function -> flag
 
 
@@ -50,10 +49,9 @@ def run(args: argparse.Namespace) -> None:
     import_packages(args.gym_packages)
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
-    depth = args.depth if args.depth is not None else model.prediction_depth or DEPTH
     try:
         env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust, args.gym_packages)
-        played = play(model, env, args.steps, depth, args.deterministic, args.seed)
+        played = play(model, env, args.steps, args.depth, args.deterministic, args.seed)
     except ValueError as error:
         name, space, message = str(error).partition(" ")
         raise ValueError(f"{FLAGS.get(name, name)}{space}{message}") from error
@@ -68,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
     if args.video:
         from sb3_eqr.visualize import record  # only videos need its libraries
 
-        record(model, env, folder / "play", depth=depth, seed=args.seed, deterministic=args.deterministic)
+        record(model, env, folder / "play", depth=args.depth, seed=args.seed, deterministic=args.deterministic)
     print(diagnostics.summary)
     table = tables["transition"][["steps_ahead", "loss", "loss_shuffled", "loss_still"]]
     print(table.to_string(index=False, float_format="{:.2g}".format))

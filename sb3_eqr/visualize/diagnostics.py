@@ -44,6 +44,16 @@ class Diagnostics(NamedTuple):
     symmetry_trained: bool = True  # the same for ρ
 
     @property
+    def has_group(self) -> bool:
+        """Whether κ(x, a) is what an action does; without a group, it is the next state."""
+        return not all(part.group.startswith("none") for part in self.generators)
+
+    @property
+    def compares_blocks(self) -> bool:
+        """Whether there are several blocks, or true factors to compare one with."""
+        return len(self.blocks) > 1 or self.disentanglement.information is not None
+
+    @property
     def summary(self) -> str:
         """The verdict in one sentence, and what to do in a second one."""
         (skill, gain), (latent_skill, latent_gain) = skill_and_gain(self.loss), skill_and_gain(self.transition)

@@ -63,7 +63,7 @@ def record(
     env: GymEnv | str,
     path: str | pathlib.Path,
     n_steps: int = 200,
-    depth: int = 5,
+    depth: int | None = None,
     seed: int = 0,
     deterministic: bool = True,
 ) -> list[pathlib.Path]:
@@ -77,14 +77,14 @@ def record(
         Of several environments the first is shown, with ``render_mode="rgb_array"`` its rendering, else the observations
     :param path: of the files, without .mp4 and .gif; folders are created
     :param n_steps: number of environment steps, one frame each; more than ``depth``
-    :param depth: M ≥ 1
+    :param depth: M ≥ 1; ``None``: the agent's, or 5 if it has 0
     :param seed: seed of the environment and of the agent's noise
     :param deterministic: whether the agent acts without noise
     :return: the MP4 (H.264), and the GIF, which has every second frame
     :raises ValueError: for an argument out of range, or an environment with other spaces than the agent's
     """
     latents.check_agent("record", model)
-    check("depth", depth, integer(1))
+    depth = latents.known_depth(model, depth)
     check("n_steps", n_steps, integer(depth + 1))
     with preserved_rng_state(model.action_space):
         film = shoot(model, env, n_steps, seed, deterministic)

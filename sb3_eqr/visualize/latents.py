@@ -24,6 +24,7 @@ from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import PyTorchObs, SequenceReplayBufferSamples
 
 CHUNK = 256  # observations encoded at once
+DEPTH = 5  # for agents without latent losses
 # Keys of ``info`` under which an environment may report its true state, as those of sb3_eqr.envs do.
 FACTOR_KEYS = ("position", "angle", "velocity", "rotation", "translation")
 
@@ -61,6 +62,13 @@ def check_agent(name: str, model: Any) -> None:
         raise ValueError(f"{name} needs an EqR agent with a latent model, got {found}, which has none.")
 
 
+def known_depth(model: EqROffPolicy, depth: int | None) -> int:
+    """M as given, or that of the agent, or ``DEPTH``; a ValueError if it is not a positive integer."""
+    depth = (model.prediction_depth or DEPTH) if depth is None else depth
+    check("depth", depth, integer(1))
+    return depth
+
+
 def as_vec_env(model: EqROffPolicy, env: GymEnv | str) -> VecEnv:
     """The environment, or that with this gymnasium id, with images channels first; a ValueError if its spaces are others."""
     found = model._wrap_env(make_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
@@ -80,7 +88,12 @@ def reset(model: EqROffPolicy, env: VecEnv, seed: int) -> Any:
 
 
 def play(
-    model: EqROffPolicy, env: GymEnv | str, n_steps: int = 1000, depth: int = 5, deterministic: bool = False, seed: int = 0
+    model: EqROffPolicy,
+    env: GymEnv | str,
+    n_steps: int = 1000,
+    depth: int | None = None,
+    deterministic: bool = False,
+    seed: int = 0,
 ) -> Play:
     """
     Run the agent and collect windows of its steps. All random generators except the environments' keep their states.
@@ -88,7 +101,7 @@ def play(
     :param model: any EqR agent
     :param env: an environment with the agent's spaces, preprocessed as in training; or its gymnasium id
     :param n_steps: number of steps over all environments, at least 2 · depth + 2 each
-    :param depth: M ≥ 1, number of steps in each window
+    :param depth: M ≥ 1, number of steps in each window; ``None``: the agent's, or 5 if it has 0
     :param deterministic: whether the agent acts without noise instead of exploring
     :param seed: seed of the environment and of the agent's noise
     :return: all complete windows, in order
@@ -96,7 +109,7 @@ def play(
     """
     check_agent("play", model)
     env = as_vec_env(model, env)
-    check("depth", depth, integer(1))
+    depth = known_depth(model, depth)
     check("n_steps", n_steps, integer((2 * depth + 2) * env.num_envs))
     factors: list[np.ndarray | None] = []
     with preserved_rng_state(model.action_space, env.action_space):
@@ -232,6 +245,8 @@ def latents(model: EqROffPolicy, samples: SequenceReplayBufferSamples) -> Latent
         outputs = latent_model.reward_net(predicted.flatten(0, 1))  # (N * M, 1 or 3)
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
+        else:
+            outputs *= model.reward_scale
     following = following.unflatten(0, mask.shape)
     return Latents(states, following, predicted, outputs.view(mask.shape), actions, rewards, mask)
 

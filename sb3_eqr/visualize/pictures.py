@@ -37,15 +37,14 @@ def all_pictures(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequ
     :param diagnostics: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
     :param actions: names of the actions, (A,)
     :param factors: names of the true factors, (F,), if known
-    :return: name of the file without suffix -> figure; without a group, κ(x, a) is the next state, not what an action does,
-        and one block has no other to be correlated with, so that their figures are left out
+    :return: name of the file without suffix -> figure; those that say nothing about this agent are left out
     """
     with styled():
         figures = {"transition": transition_figure(diagnostics), "collapse": spectrum_figure(diagnostics)}
-        if not all(part.group.startswith("none") for part in diagnostics.generators):
+        if diagnostics.has_group:
             figures["motion"] = motion_figure(diagnostics, actions)
             figures["generators"] = generators_figure(diagnostics, actions)
-        if len(diagnostics.blocks) > 1 or diagnostics.disentanglement.information is not None:
+        if diagnostics.compares_blocks:
             figures["disentanglement"] = disentanglement_figure(diagnostics, factors)
         if diagnostics.rewards_trained and not np.isnan(diagnostics.rewards.explained).all():  # NaN if rewards do not vary
             figures["rewards"] = rewards_figure(diagnostics)

@@ -18,23 +18,26 @@ def all_tables(diagnostics: Diagnostics, actions: Sequence[str], factors: Sequen
     :param diagnostics: see :func:`~sb3_eqr.visualize.diagnostics.diagnose`
     :param actions: names of the actions, (A,)
     :param factors: names of the true factors, (F,), if known
-    :return: name of the file without suffix -> table; the order of columns is stable, new ones are added at the end
+    :return: name of the file without suffix -> table, without those that say nothing about this agent; the order of columns is
+        stable, new ones are added at the end
     """
     symmetry, collapse = diagnostics.action_symmetry, diagnostics.collapse._asdict()
     spectrum = {f"spectrum {i}": value for i, value in enumerate(collapse.pop("spectrum"))}
     n_windows = int(diagnostics.loss.n_windows[0])
-    return {
+    tables = {
         "transition": _transition(diagnostics),
-        "motion": _motion(diagnostics, actions),
-        "generators": _generators(diagnostics, actions),
-        "disentanglement": _disentanglement(diagnostics, actions, factors),
-        "action_symmetry": pd.DataFrame(
-            [(*symmetry, diagnostics.symmetry_trained)] if symmetry else [], columns=[*ActionSymmetry._fields, "trained"]
-        ),
         "collapse": _measures(collapse | spectrum),
         "rewards": _per_step(diagnostics.rewards._asdict()).assign(trained=diagnostics.rewards_trained),
         "summary": _measures({"verdict": diagnostics.verdict, **diagnostics.scalars, "windows": n_windows}),
     }
+    if diagnostics.has_group:
+        tables |= {"motion": _motion(diagnostics, actions), "generators": _generators(diagnostics, actions)}
+    if diagnostics.compares_blocks:
+        tables["disentanglement"] = _disentanglement(diagnostics, actions, factors)
+    if symmetry is not None:
+        row = (*symmetry, diagnostics.symmetry_trained)
+        tables["action_symmetry"] = pd.DataFrame([row], columns=[*ActionSymmetry._fields, "trained"])
+    return tables
 
 
 def write_tables(tables: dict[str, pd.DataFrame], folder: pathlib.Path) -> None:

@@ -77,7 +77,8 @@ class ResumableExperiment(ExperimentManager):
             self._remove_folder()
             raise
         if found is not None and isinstance(found[0], EqROffPolicy):
-            print(f"{in_one_line(found[0])}. The defaults of {type(found[0]).__name__} in Python may differ.")
+            given = ", ".join(sorted(self._hyperparams.keys() - {"policy"}))
+            print(f"{in_one_line(found[0])}. Set by the hyperparameters: {given or 'nothing'}; the rest are defaults.")
         return found
 
     def _remove_folder(self) -> None:

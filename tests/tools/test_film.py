@@ -269,7 +269,7 @@ def test_a_failed_video_leaves_no_files(make, tmp_path, monkeypatch):
 def test_invalid_arguments_raise(make, tmp_path):
     model = make(ChainEnv(8))
     with pytest.raises(ValueError, match="n_steps must be an integer >= 6"):
-        record(model, ChainEnv(), tmp_path / "v", n_steps=5)
+        record(model, ChainEnv(), tmp_path / "v", n_steps=5, depth=5)
     with pytest.raises(ValueError, match="env must have the agent's spaces"):
         record(model, ImageEnv(), tmp_path / "v")
 

@@ -151,6 +151,17 @@ def test_only_predictions_pass_the_predictor():
     assert np.allclose(found.loss.still, found.transition.still / 2, rtol=1e-4)  # ‖x‖ = √2
 
 
+def test_predicted_rewards_have_the_unit_of_rewards():
+    """r_ψ = 1 with rewards divided by 3 predicts 3."""
+    model = by_hand()
+    model.policy.latent_model.reward_net[-1].bias.data.fill_(1)
+    model.reward_scale = 3.0
+    windows = play(model, make_vec_env(functools.partial(Ring, unwound=True)), 100)
+    assert windows.samples.mask.shape[1] == 3  # the agent's depth
+    rewards = windows.samples.rollout_rewards[windows.samples.mask[:, 0] > 0, 0]
+    assert diagnose(model, windows).rewards.error[0] == pytest.approx(float((rewards - 3).square().mean()), rel=1e-5)
+
+
 def test_constant_rewards_and_signs():
     model = make_model(network={"reward_loss": "categorical"})
     window = play(model, make_vec_env(Ring), 100, depth=2)
@@ -192,14 +203,15 @@ def test_every_group(group):
     assert np.isfinite(found.motion.predicted).all() and np.isfinite(found.transition.error).all()
     assert sum(part.mean.shape[1] for part in found.generators) == n_blocks
     assert found.disentanglement.information.shape == (n_blocks, 1) and (found.action_symmetry is not None) == inverse
-    assert set(all_tables(found, ["0", "1"])) == set(FILES)
+    of_groups = set() if inverse else {"motion", "generators", "action_symmetry"}
+    assert set(all_tables(found, ["0", "1"])) == set(FILES) - of_groups
     figure = latent_figure(model, encode(model, windows.samples.observations), windows.factors[:, 0], "angle")
     assert len(figure.axes) == n_blocks + 1  # including the colour bar
     if group in DRAWN:
-        of_groups = set() if inverse else {"motion", "generators"}
         assert {*all_pictures(found, ["0", "1"]), "latents"} == set(PICTURES) - of_groups
         unknown = found._replace(disentanglement=found.disentanglement._replace(information=None))
-        assert ("disentanglement" in all_pictures(unknown, ["0", "1"])) == (n_blocks > 1)
+        for found_files in (all_pictures(unknown, ["0", "1"]), all_tables(unknown, ["0", "1"])):
+            assert ("disentanglement" in found_files) == (n_blocks > 1)
 
 
 def test_dict_observations_and_an_agent_without_latent_losses():

@@ -292,7 +292,7 @@ def test_a_signal_to_end_saves_the_agent_and_one_before_training_leaves_no_folde
     line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 900 -params learning_starts:100 --eval-freq -1 -f {tmp_path}"
     monkeypatch.setattr(EqRQRDQN, "train", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
     shown = sb3_eqr(line)
-    assert "EqRQRDQN: SO(3)^12, euler; auxiliary losses: AET 2. The defaults" in shown.out
+    assert "EqRQRDQN: SO(3)^12, euler; auxiliary losses: AET 2. Set by the hyperparameters: " in shown.out
     model = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_1" / "CartPole-v1.zip")
     assert 100 < model.num_timesteps < 900
     monkeypatch.setattr(EqRQRDQN, "_setup_model", lambda *_: signal.raise_signal(signal.SIGTERM))

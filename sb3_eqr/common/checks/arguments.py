@@ -120,7 +120,7 @@ ALGORITHM: dict[str, Rule] = {
     "stats_window_size": integer(1),
     "tensorboard_log": TEXT | NONE,
     "policy_kwargs": DICTIONARY | NONE,
-    "verbose": integer(0, 2),
+    "verbose": integer(0, 2) | FLAG,
     "seed": integer(0, 2**32 - 1) | NONE,
 }
 POLICY: dict[str, Rule] = {
