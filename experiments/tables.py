@@ -3,8 +3,8 @@ Tables of docs/results that ``sb3-eqr benchmark report`` does not have: other me
 folders of a benchmark or files of packed runs.
 
     python -m experiments.tables docs/results/worlds.jsonl.xz --games torus_of_8 --agents default plain --baseline plain
-        --measures goals score R2 skill
-    python -m experiments.tables docs/results/ablation.jsonl.xz --measures score end skill --baseline recipe --ratio
+        --measures goals score R2
+    python -m experiments.tables docs/results/ablation.jsonl.xz --measures score end --baseline recipe --ratio
     python -m experiments.tables docs/results/atari100k/gpu.jsonl.xz --games Boxing --measures 0-20000 20000-40000
     python -m experiments.tables docs/results/first_page.jsonl.xz --agents aet_5 plain --figure goals distractors.png
     python -m experiments.tables docs/results --differences differences.png
@@ -117,8 +117,6 @@ MEASURES: dict[str, Callable[[Row], float]] = {
     "return": lambda row: np.mean(row["training"]["score"]),
     "goals": lambda row: len(goals(row)),
     "first_goal": lambda row: min(goals(row), default=np.nan),
-    "skill": lambda row: last(row, "latent/skill"),  # of the latent model one step ahead, as LatentCallback logged it
-    "skill_last": lambda row: last(row, "latent/skill_last"),  # the same M steps ahead
     "R2": lambda row: np.nan,  # of the true state from the trunk's features, measured after training (experiments.probes)
     "minutes": lambda row: row["wall_clock_s"] / 60,
 }

@@ -41,8 +41,8 @@ def test_measures_by_hand():
         np.isnan(measure(row(stopped_at=59), "20-60")) and np.isnan(measure(row(), "R2")) and np.isnan(measure(row(), "at10"))
     )
     assert measure(row(measures={"goals": 7}), "goals") == 7  # what was measured when the run was made
-    logged = [{"step": 10, "latent/skill": 0.5}, {"step": 20, "aet_loss": 0.25}]
-    assert measure(row(losses=logged), "skill") == 0.5 and measure(row(losses=logged), "train/aet_loss") == 0.25
+    logged = [{"step": 10, "aet_loss": 0.5}, {"step": 20, "aet_loss": 0.25}]
+    assert measure(row(losses=logged), "train/aet_loss") == 0.25
 
 
 def test_series_are_tenths_of_the_run():
