@@ -11,10 +11,11 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
+from sb3_eqr.benchmark.agents import find_agent
 from sb3_eqr.common.networks.encoders import ImpalaTrunk, NormalizedExtractor
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
-from sb3_eqr.configurations import configuration_files, with_schedule
+from sb3_eqr.configurations import configuration_files, merged, with_schedule
 from tests.models import all_finite
 from tests.toys import ImageEnv
 
@@ -34,7 +35,7 @@ EXPECTED = {
 }
 FULL = ("eqr_rainbow", "paper", "released", "se2+aet+r+get", "eqr_bbf")
 EXPECTED |= dict.fromkeys(FULL, ("SE(2)^12", {"aet", "symmetry", "reward"}))
-EXPECTED |= dict.fromkeys(("rainbow", "qrdqn", "der", "drq"), (None, set()))
+EXPECTED |= dict.fromkeys(("rainbow", "rainbow_resets", "qrdqn", "der", "drq"), (None, set()))
 
 
 def test_the_tables_and_the_files_agree():
@@ -119,6 +120,7 @@ def test_each_configuration_trains_as_in_the_table(name):
     network["net_arch"] = [32]
     if name == "eqr_bbf":
         network["features_extractor_kwargs"]["width_scale"] = 0.25
+    if "resets" in arguments:
         arguments["resets"].update(interval=8, annealing_steps=4)
     kept = {key: value for key, value in arguments.items() if key not in SMALL}
     env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
@@ -138,7 +140,7 @@ def test_each_configuration_trains_as_in_the_table(name):
     encoder, layer = model.policy.online.features_extractor, model.policy.group_layer
     assert (layer and f"{layer.group}^{layer.n_blocks}") == encoder_name
     noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
-    assert noisy == (name not in ("drq", "eqr_bbf"))
+    assert noisy == (name not in ("drq", "eqr_bbf", "rainbow_resets"))
     assert model.policy.latent_model.action_dim == 3
 
     # losses: exactly those of the table are logged, and they are finite
@@ -184,6 +186,12 @@ def test_eqr_bbf_follows_the_papers_recipe():
     assert (model.prediction_depth, model.aet_coef, model.symmetry_coef) == (5, 5, 5)
     assert (model.gradient_steps, model.train_freq.frequency, model.batch_size) == (2, 1, 32)
     assert model.policy.act_with_target and model.double_q
+
+
+def test_rainbow_resets_is_the_agent_of_our_atari_runs():
+    """The plan of those runs has its own file, as it was written before them."""
+    full, planned = load_configuration("eqr_rainbow"), find_agent(f"eqr_rainbow:{ROOT}/experiments/settings/atari/slow_target.yml")
+    assert merged(full, load_configuration("rainbow_resets")) == merged(full, planned.changes)
 
 
 @pytest.mark.parametrize("path", configuration_files().values(), ids=lambda path: path.stem)
