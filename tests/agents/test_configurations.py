@@ -190,7 +190,8 @@ def test_eqr_bbf_follows_the_papers_recipe():
 
 def test_rainbow_resets_is_the_agent_of_our_atari_runs():
     """The plan of those runs has its own file, as it was written before them."""
-    full, planned = load_configuration("eqr_rainbow"), find_agent(f"eqr_rainbow:{ROOT}/experiments/settings/atari/slow_target.yml")
+    planned = find_agent(f"eqr_rainbow:{ROOT}/experiments/settings/atari/slow_target.yml")
+    full = load_configuration("eqr_rainbow")
     assert merged(full, load_configuration("rainbow_resets")) == merged(full, planned.changes)
 
 
