@@ -23,7 +23,8 @@ def load_scores(folder: str | pathlib.Path) -> pd.DataFrame:
 
     :param folder: folder of the benchmark, or a file of ``sb3-eqr benchmark pack``
     :return: a row per episode: agent, game, seed, step, kind ("curve" or "final" for evaluations, or "training"), episode
-        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps; NaN if not recorded)
+        (counted from 0 within an evaluation, or within training), score (raw), length (agent steps, in
+        training on Atari raw frames; NaN if not recorded)
     :raises ValueError: for a folder without finished runs
     """
     frames = []

@@ -325,8 +325,8 @@ class EqRAlgorithm(EqROffPolicy):
         buffer, update = self.replay_buffer, self._captured or self._update
         assert buffer is not None
         self._start_round(buffer)
-        for _ in range(gradient_steps):
-            if self._resets.is_due(self._n_updates, self._updates_left()):
+        for i in range(gradient_steps):
+            if self._resets.is_due(self._n_updates, gradient_steps - i + self._updates_left()):
                 self._reset()
             buffer.n_steps, buffer.gamma = self._resets.annealed(self._n_updates, self.n_steps, self.gamma)
             buffer.prediction_depth = self.depth
@@ -371,7 +371,7 @@ class EqRAlgorithm(EqROffPolicy):
         return norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(norms))
 
     def _updates_left(self) -> float:
-        """How many updates will still be made in this call of ``learn``, as the expected number if rounds are episodes."""
+        """How many updates later rounds of this call of ``learn`` will make, as the expected number if rounds are episodes."""
         frequency: Any = self.train_freq
         if self.gradient_steps < 0:
             per_step = 1.0

@@ -173,11 +173,10 @@ def test_the_buffer_uses_the_annealed_n_and_gamma(make, monkeypatch):
 
     monkeypatch.setattr(buffer, "_windows", watched)
     model.learn(80)
-    assert model._resets.done == [20, 40]
+    assert model._resets.done == [20, 40, 60]
     assert [update for update, _, _ in used] == list(range(model._n_updates))
     for update, n_steps, gamma in used:
-        since = update % 20 if update < 60 else update - 40  # the last reset
-        share = min(since, 10) / 10
+        share = min(update % 20, 10) / 10
         assert n_steps == round(8 * 0.25**share)
         assert gamma == pytest.approx(1 - 0.5 * 0.1**share)
     assert {n for _, n, _ in used} == {8, 7, 6, 5, 4, 3, 2}
@@ -227,6 +226,7 @@ def test_when_resets_happen(make):
     model = make(ChainEnv(), resets={"interval": 12}).learn(90)  # 100 updates in steps 41 to 90, two per step
     assert model._n_updates == 100
     assert model._resets.done == [12, 24, 36, 48, 60, 72, 84]  # after 84, 16 are left; after 96, 4
+    assert make(ChainEnv(), resets={"interval": 50}).learn(90)._resets.done == [50]  # after which 50 are left
     within_rounds = make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)
     assert within_rounds._resets.done == [7, 14, 21, 28, 35, 42, 49]
     postponed = make(ChainEnv(), resets={"interval": 30}).learn(60)  # it is due in the last tenth of the call of learn

@@ -227,7 +227,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(make, tmp_path):
     model.load_replay_buffer(tmp_path / "buffer")
     assert model._resets.done == [30] and not same(model, whole)
     model.learn(80, reset_num_timesteps=False)
-    assert model.num_timesteps == 160 and model._n_updates == whole._n_updates and model._resets.done == [30, 60]
+    assert model.num_timesteps == 160 and model._n_updates == whole._n_updates and model._resets.done == [30, 60, 90]
     assert same(model, whole) and same_moments(model, whole)
 
 
@@ -316,6 +316,16 @@ def test_a_loaded_replay_buffer_replaces_the_models(model, tmp_path):
     model.learn(4, reset_num_timesteps=False)
     with pytest.warns(UserWarning, match="saved at step 46, but the model is at step 50"):
         model.load_replay_buffer(tmp_path / "buffer")
+
+
+def test_a_replay_buffer_of_another_size_and_several_environments_loads(make, tmp_path):
+    """Eight transitions of each of eight environments, the number of its environments, in place of sixteen."""
+    large, small = (make(make_vec_env(ChainEnv, 8), buffer_size=np.int64(8 * n), learning_starts=200) for n in (16, 8))
+    large.learn(64).save_replay_buffer(tmp_path / "buffer")
+    with pytest.warns(UserWarning, match="saved at step 64"):
+        small.load_replay_buffer(tmp_path / "buffer")
+    assert small.replay_buffer.buffer_size == 16
+    assert np.array_equal(small.replay_buffer._episode_starts, large.replay_buffer._episode_starts)
 
 
 class Runs:

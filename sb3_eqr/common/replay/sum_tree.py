@@ -13,7 +13,7 @@ class SumTree:
     """
 
     def __init__(self, capacity: int):
-        self.capacity = capacity
+        self.capacity = capacity = int(capacity)  # it may be of NumPy
         self._block = 1 << max(capacity.bit_length() // 2 - 2, 4)
         self._leaves = np.zeros((-(-capacity // self._block), self._block))
         self._sums = np.zeros(len(self._leaves))

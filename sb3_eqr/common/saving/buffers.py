@@ -75,7 +75,7 @@ def _packed(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
 def _unpacked(value: Any, like: Any, name: str, archive: zipfile.ZipFile, resized: dict[int, int]) -> Any:
     """What :func:`_packed` was given. Its kind is that of the same attribute of a new buffer, ``like``."""
     if isinstance(like, np.ndarray):
-        shape = (resized.get(like.shape[0], like.shape[0]), *like.shape[1:]) if like.ndim else ()
+        shape = like.shape if like.ndim < 2 else (resized.get(like.shape[0], like.shape[0]), *like.shape[1:])
         return _array(value, like.dtype, shape, name, archive)
     if isinstance(like, FrameStore):
         return _store(value, like, name, archive, resized)
