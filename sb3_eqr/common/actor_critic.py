@@ -19,11 +19,16 @@ from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
-RULES = {**ALGORITHM, "learning_starts": integer(0), "target_update_interval": integer(1)}
+RULES = {
+    **ALGORITHM,
+    "learning_starts": integer(0),
+    "target_update_interval": integer(1),
+    "top_quantiles_to_drop_per_net": integer(0),  # of TQC
+}
 SCALE_INTERVAL = 1_000  # updates between two estimates of the rewards' spread, each of which takes all rewards
 MIN_REWARDS = 100  # for an estimate
 MIN_SPREAD = 1e-4  # as a share of the largest reward; below, it may be rounding
-MAX_REWARD = 10.0  # in units of the spread, as VecNormalize's clip_reward: a first rare reward is far beyond the last estimate
+MAX_REWARD = 10.0  # spreads from the mean, as VecNormalize's clip_reward: a first rare reward is far beyond the last estimate
 
 
 class EqRActorCritic(EqROffPolicy):
@@ -34,7 +39,6 @@ class EqRActorCritic(EqROffPolicy):
     """
 
     policy: EqRActorCriticPolicy
-    reward_scale: float  # the standard deviation of the rewards in the replay buffer; saved with the model
 
     def __init__(
         self,
@@ -152,8 +156,9 @@ class EqRActorCritic(EqROffPolicy):
         """One update of encoder and latent model, and of their moving averages."""
         policy, objective = self.policy, self.objective
         assert samples.rollout_rewards is not None
-        rewards = (samples.rollout_rewards / self.reward_scale).clamp(-MAX_REWARD, MAX_REWARD)
-        samples = samples._replace(rollout_rewards=rewards)
+        if policy.options.reward_loss == "mse":  # the other loss needs their signs
+            rewards = (samples.rollout_rewards - self.reward_mean) / self.reward_scale
+            samples = samples._replace(rollout_rewards=rewards.clamp(-MAX_REWARD, MAX_REWARD))
         observations = objective.augment(samples.observations)
         features = policy.encoder(observations)
         names = [name for name, coef in self.loss_coefs.items() if coef > 0]
@@ -166,11 +171,11 @@ class EqRActorCritic(EqROffPolicy):
         self._monitor.add({f"{name}_loss": mean.detach() for name, mean in means.items()})
 
     def _find_reward_scale(self, buffer: SequenceReplayBuffer, gradient_steps: int) -> None:
-        """Estimate the standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
+        """Estimate mean and standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
         rewards = buffer.rewards[: buffer.size()]
         is_due = -self._n_updates % SCALE_INTERVAL < gradient_steps or rewards.size < SCALE_INTERVAL
         if is_due and rewards.size >= MIN_REWARDS:
-            self.reward_scale = spread_of(buffer._normalize_reward(rewards, self._vec_normalize_env))
+            self.reward_mean, self.reward_scale = moments(buffer._normalize_reward(rewards, self._vec_normalize_env))
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_monitor", "objective", "_trained"]
@@ -180,10 +185,10 @@ class EqRActorCritic(EqROffPolicy):
         return [*names, "policy.latent_optimizer"] if self.policy.has_latent else names, variables
 
 
-def spread_of(rewards: np.ndarray) -> float:
-    """The standard deviation of rewards; 1 if all are nearly equal."""
-    spread = float(rewards.std(dtype=np.float64))
-    return spread if spread > MIN_SPREAD * np.abs(rewards).max() else 1.0
+def moments(rewards: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of rewards; 1 in place of the latter if all are nearly equal."""
+    mean, spread = (float(found(rewards, dtype=np.float64)) for found in (np.mean, np.std))
+    return mean, spread if spread > MIN_SPREAD * np.abs(rewards).max() else 1.0
 
 
 class BeforeSamples:

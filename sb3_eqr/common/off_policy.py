@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_normalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_eqr.common.checks import validation
@@ -37,7 +37,10 @@ class EqROffPolicy(FiniteData, SafeFiles):
     reward_coef: float
     policy_description: dict[str, str]
     frame_stack = 1
-    reward_scale = 1.0  # by which the reward network's targets are divided
+    reward_mean, reward_scale = (
+        0.0,
+        1.0,
+    )  # of the rewards in the replay buffer, if the reward network's targets are standardised
     _monitor: UpdateMonitor
 
     @property
@@ -69,6 +72,12 @@ class EqROffPolicy(FiniteData, SafeFiles):
             wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         cls._check_action_space(wrapped.action_space)
         return wrapped
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """As SB3's ``set_env``; raises ValueError if VecNormalize cannot be used with this environment."""
+        normalize = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
+        validation.check_normalization(normalize, self.observation_space)
+        super().set_env(env, force_reset)
 
     def _new_replay_buffer(self, buffer_class: type[SequenceReplayBuffer], n_steps: int) -> SequenceReplayBuffer:
         legal = inspect.signature(buffer_class).parameters

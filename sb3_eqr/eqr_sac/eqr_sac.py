@@ -73,7 +73,7 @@ class EqRSAC(EqRActorCritic, SAC):
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: weight ≥ 0 of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: weight ≥ 0 of the group-equivariant transition loss; 0 disables it
-        :param reward_coef: weight ≥ 0 of the loss of the rewards, divided by their standard deviation; 0 disables it
+        :param reward_coef: weight ≥ 0 of the loss of the standardised rewards; 0 disables it
         :raises ValueError: if an argument is out of range
         :raises TypeError: if an argument is unknown; the message suggests the nearest name
         """

@@ -73,9 +73,15 @@ class EqRTQC(EqRActorCritic, TQC):
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: weight ≥ 0 of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: weight ≥ 0 of the group-equivariant transition loss; 0 disables it
-        :param reward_coef: weight ≥ 0 of the loss of the rewards, divided by their standard deviation; 0 disables it
+        :param reward_coef: weight ≥ 0 of the loss of the standardised rewards; 0 disables it
         :raises ValueError: if an argument is out of range
         :raises TypeError: if an argument is unknown; the message suggests the nearest name
         """
         arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         super().__init__(**arguments)
+
+    def _check_losses(self) -> None:
+        super()._check_losses()
+        dropped, n_quantiles = self.top_quantiles_to_drop_per_net, self.critic.n_quantiles
+        if dropped >= n_quantiles:
+            raise ValueError(f"top_quantiles_to_drop_per_net must be below n_quantiles={n_quantiles}, got {dropped}.")

@@ -246,7 +246,7 @@ def latents(model: EqROffPolicy, samples: SequenceReplayBufferSamples) -> Latent
         if outputs.shape[1] == 3:
             outputs = outputs.softmax(dim=1) @ outputs.new_tensor([[-1.0], [0.0], [1.0]])
         else:
-            outputs *= model.reward_scale
+            outputs = model.reward_mean + model.reward_scale * outputs
     following = following.unflatten(0, mask.shape)
     return Latents(states, following, predicted, outputs.view(mask.shape), actions, rewards, mask)
 

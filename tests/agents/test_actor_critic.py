@@ -226,9 +226,11 @@ def test_no_learning_rate_is_negative_in_the_last_rollout(agent):
 
 
 @EACH
-def test_rewards_are_divided_by_their_spread(agent):
+def test_rewards_are_standardised(agent):
     model = make(agent, learning_starts=100, n_steps=2).learn(130)
-    assert model.reward_scale == pytest.approx(model.replay_buffer.rewards[:130].std(), rel=0.1)
+    rewards = model.replay_buffer.rewards[:130]
+    assert model.reward_scale == pytest.approx(rewards.std(), rel=0.1)
+    assert model.reward_mean == pytest.approx(rewards.mean(), abs=0.2 * model.reward_scale)
 
     def after(env, n):
         return make(agent, env, learning_starts=0).learn(n).reward_scale
@@ -245,17 +247,21 @@ def test_rewards_are_divided_by_their_spread(agent):
 
 
 @EACH
-def test_a_reward_far_beyond_the_last_estimate_counts_as_ten_spreads(agent, monkeypatch):
-    model = make(agent, learning_starts=100).learn(130)
+@pytest.mark.parametrize(
+    "loss, expected", [("mse", [[2.0, 10.0], [-10.0, -6.0]]), ("categorical", [[101.0, 1e4], [-1e4, 97.0]])]
+)
+def test_a_reward_far_beyond_the_last_estimate_counts_as_ten_spreads(agent, loss, expected, monkeypatch):
+    """But the categorical loss needs signs."""
+    model = make(agent, learning_starts=100, policy_kwargs={"reward_loss": loss}).learn(130)
     seen, losses = [], model.objective.latent_losses
     monkeypatch.setattr(
         model.objective, "latent_losses", lambda *args: [seen.append(args[1].rollout_rewards), losses(*args)][1]
     )
-    model.reward_scale = 0.5
+    model.reward_mean, model.reward_scale = 100.0, 0.5
     samples = model.replay_buffer.sample(2)
-    rewards = th.tensor([[1.0, 1e4], [-1e4, -3.0]])
+    rewards = th.tensor([[101.0, 1e4], [-1e4, 97.0]])
     model._update_latent_model(samples._replace(rollout_rewards=rewards))
-    assert seen[0].tolist() == [[2.0, 10.0], [-10.0, -6.0]]
+    assert seen[0].tolist() == expected
 
 
 @EACH
@@ -296,7 +302,7 @@ def test_one_update_by_hand(agent):
     policy, before = model.policy, tensors(model)
     np.random.seed(5)
     samples = model.replay_buffer.sample(8)
-    scale = model.replay_buffer.rewards[:100].std()
+    rewards = (samples.rollout_rewards - model.replay_buffer.rewards[:100].mean()) / model.replay_buffer.rewards[:100].std()
     policy.set_training_mode(True)
     latent, target = policy.latent_model, policy.latent_target
     states = [latent.embedding(policy.encoder(samples.observations))]
@@ -307,7 +313,7 @@ def test_one_update_by_hand(agent):
         wanted = target.projection(target.embedding(policy.latent_encoder(samples.rollout_observations[:, m])))
         found = latent.predictor(latent.projection(states[-1]))
         distance = (found / found.norm(dim=1, keepdim=True) - wanted / wanted.norm(dim=1, keepdim=True)).square().sum(dim=1)
-        error = (latent.reward_net(states[-1])[:, 0] - samples.rollout_rewards[:, m] / scale).square()
+        error = (latent.reward_net(states[-1])[:, 0] - rewards[:, m]).square()
         aet, reward = aet + samples.mask[:, m] * distance, reward + samples.mask[:, m] * error
     loss = ((aet + reward) / samples.mask.sum(dim=1)).mean()
     parameters = {f"encoder.{name}": p for name, p in policy.encoder.named_parameters()}
@@ -402,6 +408,24 @@ def test_wrong_arguments_fail_before_the_first_step(agent, kwargs, message):
         make(agent, **kwargs)
     with pytest.raises(AssertionError, match="Use EqRQRDQN or EqRRainbow for a Discrete one"):
         make(agent, "CartPole-v1")
+
+
+def test_quantiles_to_drop():
+    for n in (-1, 25, 1.5):
+        with pytest.raises(ValueError, match="top_quantiles_to_drop_per_net must be"):
+            make(EqRTQC, top_quantiles_to_drop_per_net=n)
+    model = make(EqRTQC)
+    model.top_quantiles_to_drop_per_net = 25
+    with pytest.raises(ValueError, match="must be below n_quantiles=25, got 25"):
+        model.learn(1)
+
+
+@EACH
+def test_actions_that_are_integers_are_stored_as_sb3_scales_them(agent):
+    """0, 1, 2, 3 as -1, -1/3, 1/3, 1. SB3's own buffer cuts them to -1, 0, 0, 1."""
+    model = make(agent, gym.wrappers.TransformAction(MoveEnv(), np.sign, spaces.Box(0, 3, (2,), np.int64)))
+    stored = model.learn(20).replay_buffer.actions[:20]
+    assert len(np.unique(stored)) > 3 and np.abs(stored).max() <= 1
 
 
 @EACH

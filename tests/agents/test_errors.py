@@ -96,6 +96,13 @@ def test_environments_that_do_not_fit(make, env, kwargs, message):
         make(env(), **kwargs)
 
 
+def test_a_new_environment_is_checked_like_the_first(make):
+    model = make(make_vec_env(ImageEnv), "CnnPolicy")
+    with pytest.raises(ValueError, match="VecNormalize must normalise floats"):
+        model.set_env(VecNormalize(make_vec_env(ImageEnv)))
+    assert not isinstance(model.env, VecNormalize)
+
+
 @pytest.mark.parametrize("stacked", [False, True])
 def test_vec_normalize_outside_of_the_other_wrappers(make, stacked):
     env = VecFrameStack(make_vec_env(ImageEnv), 2) if stacked else make_vec_env(ImageEnv)

@@ -152,14 +152,14 @@ def test_only_predictions_pass_the_predictor():
 
 
 def test_predicted_rewards_have_the_unit_of_rewards():
-    """r_ψ = 1 with rewards divided by 3 predicts 3."""
+    """r_ψ = 1 with rewards of mean 2 and spread 3 predicts 5."""
     model = by_hand()
     model.policy.latent_model.reward_net[-1].bias.data.fill_(1)
-    model.reward_scale = 3.0
+    model.reward_mean, model.reward_scale = 2.0, 3.0
     windows = play(model, make_vec_env(functools.partial(Ring, unwound=True)), 100)
     assert windows.samples.mask.shape[1] == 3  # the agent's depth
     rewards = windows.samples.rollout_rewards[windows.samples.mask[:, 0] > 0, 0]
-    assert diagnose(model, windows).rewards.error[0] == pytest.approx(float((rewards - 3).square().mean()), rel=1e-5)
+    assert diagnose(model, windows).rewards.error[0] == pytest.approx(float((rewards - 5).square().mean()), rel=1e-5)
 
 
 def test_constant_rewards_and_signs():

@@ -82,8 +82,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         }
         shape = (self.buffer_size, n_envs)
         is_discrete = isinstance(action_space, spaces.Discrete)  # an index of PyTorch must be int64
-        dtype = np.int64 if is_discrete else self._maybe_cast_dtype(action_space.dtype)
-        self.actions = np.zeros((*shape, self.action_dim), dtype=dtype)
+        # SB3 scales actions of a Box to [-1, 1], which integers cannot hold.
+        self.actions = np.zeros((*shape, self.action_dim), dtype=np.int64 if is_discrete else np.float32)
         self.rewards = np.zeros(shape, dtype=np.float32)
         self.dones = np.zeros(shape, dtype=np.float32)
         self.timeouts = np.zeros(shape, dtype=np.float32)

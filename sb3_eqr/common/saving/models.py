@@ -145,7 +145,7 @@ class SafeFiles(OffPolicyAlgorithm):
         """
         As SB3's ``save``, with the state of the random generators; the file is written under a temporary name and renamed.
         Attributes are saved as plain data (:mod:`~sb3_eqr.common.saving.plain_data`), except that custom classes in
-        ``policy_kwargs`` are pickled, and need ``trust`` to be loaded.
+        ``policy_kwargs`` and functions are pickled, and need ``trust`` to be loaded.
         """
         self._before_saving()
         self.rng_state = get_rng_state(self.action_space)
@@ -185,7 +185,7 @@ class SafeFiles(OffPolicyAlgorithm):
         ``force_reset=False`` and an environment in the same state). SB3's CheckpointCallback saves in the middle of a step.
 
         :param trust: whether to load pickled Python objects in the file, which runs any code they name; needed for files with
-            custom classes in ``policy_kwargs``, and for files written by SB3's own ``save``
+            custom classes in ``policy_kwargs``, functions, and for files written by SB3's own ``save``
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: if a keyword is not an argument of the agent
         """
