@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ContinuousCritic
@@ -30,7 +31,7 @@ from torch import nn
 
 from experiments import markdown
 from experiments.tables import PARTS, difference, draw, mean_and_error
-from sb3_eqr import EqRSAC, ExactCheckpointCallback
+from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 
@@ -44,10 +45,11 @@ SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHO
 SHORT_NETWORK = {"net_arch": [128, 128]}
 NARROW_READ: dict[str, Any] = {"latent_hidden_dim": 128, "features_extractor_kwargs": {"features_dim": 128}}
 NARROW = {**NARROW_READ, "reads_features": False}
-OF_SAC: dict[str, dict[str, Any]] = {"sac": {}, "sac_layer_norm": {}, "sac_two_updates": {"gradient_steps": 2}}
-# name -> arguments of SAC, or of EqRSAC, whose defaults are those of "none"
+OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "eqr_tqc": EqRTQC}
+# name -> arguments of these, or of EqRSAC, whose defaults are those of "none"
 ARMS: dict[str, dict[str, Any]] = {
-    **OF_SAC,
+    **{name: {} for name in OTHERS},
+    "sac_two_updates": {"gradient_steps": 2},
     "none": {},
     "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
     "no_losses": {"prediction_depth": 0},
@@ -129,15 +131,14 @@ def nearest_torque(action: np.ndarray) -> int:
     return round((float(action[0]) + 1) / 2 * (N_TORQUES - 1))
 
 
-def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC:
+def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC:
     """An agent at RL Zoo's settings, or with small networks that learn in short runs."""
     given = dict(ARMS[arm])
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
-    if arm in OF_SAC:
-        return SAC(LayerNormPolicy if arm == "sac_layer_norm" else policy, env, **given, **shared)
-    return EqRSAC(policy, env, **given, **shared)
+    kind: Any = LayerNormPolicy if arm == "sac_layer_norm" else policy
+    return OTHERS.get(arm, EqRSAC)(kind, env, **given, **shared)
 
 
 def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool) -> None:
@@ -149,10 +150,10 @@ def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds
             continue
         model: Any = make_agent(arm, task, seed, is_short)
         callbacks: list[BaseCallback] = [Episodes()]
-        if isinstance(model, EqRSAC):
+        if isinstance(model, (EqRSAC, EqRTQC)):
             checkpoints = file.with_suffix("")
             if find_checkpoints(checkpoints):
-                model = EqRSAC.resume(checkpoints, make_env(task), device="cpu")
+                model = type(model).resume(checkpoints, make_env(task), device="cpu")
             callbacks.append(ExactCheckpointCallback(N_BETWEEN, checkpoints, keep=1))
         model.learn(steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=model.num_timesteps == 0)
         model.save(file.with_suffix(".zip"))  # for sb3-eqr visualize
@@ -255,7 +256,7 @@ def main() -> None:
     running = commands.add_parser("train", help="run what is not in the folder yet")
     running.add_argument("folder", type=pathlib.Path)
     running.add_argument("--tasks", nargs="+", default=COMPARED)
-    running.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    running.add_argument("--arms", nargs="+", default=["sac", "none"], choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
     timing = commands.add_parser("time", help="compare the time of a step of learning")
