@@ -388,6 +388,9 @@ def test_a_loaded_buffer_continues_like_the_saved_one(n_adds):
     stream.feed(n_adds, buffer)
     buffer.update_priorities(buffer.sample(10).indices, th.rand(10))
     copy = pickle.loads(pickle.dumps(buffer))
+    copy.device = th.device("meta")  # as after a copy on a GPU
+    assert {part.device.type for part in copy.sample(4) if isinstance(part, th.Tensor)} == {"meta"}
+    copy.device = buffer.device
     stream.feed(50, buffer, copy)
     for seed in range(3):
         for field, ours, theirs in zip(Samples._fields, draw(buffer, 100, seed), draw(copy, 100, seed), strict=True):

@@ -261,7 +261,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, following: bool = False
     ) -> PyTorchObs:
         """As :meth:`FrameStore.observations`, normalised and moved to the device, for each key of a dict."""
-        found = {key: store.observations(positions, envs, following) for key, store in self._stores.items()}
+        found = {  # a copied store has its frames in the computer's memory
+            key: store.observations(positions, envs, following).to(self.device) for key, store in self._stores.items()
+        }
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if env is None:
             return found if is_dict else found[""]
