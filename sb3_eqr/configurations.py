@@ -6,6 +6,8 @@ from typing import Any
 
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_eqr.common.checks.arguments import nearest
+
 ZOO_KEYS = ("policy", "n_timesteps", "frame_stack", "n_envs", "normalize", "env_wrapper")  # read by RL Zoo itself
 STOCK = "stock"  # the folder of settings for SB3's own agents
 
@@ -41,7 +43,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         raise ImportError("load_configuration needs PyYAML: pip install pyyaml") from error
     files = configuration_files()
     if name not in files:
-        raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.")
+        raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.{nearest(name, files)}")
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
         default = ' Any other environment has the entry "default".' if "default" in entries else ""

@@ -7,6 +7,7 @@ import sys
 from sb3_eqr.common.checks.arguments import SuggestingParser
 
 SEEDS = 5  # default
+SUITES = "atari100k, atari100k-5, minatar, classic, worlds, mujoco, smoke, smoke-atari"
 EXAMPLE = "example: sb3-eqr benchmark run results/first --suite smoke --agents eqr_qrdqn eqr_qrdqn:off --seeds 2"
 
 
@@ -19,7 +20,7 @@ def make_parser() -> SuggestingParser:
     # An absolute path is valid on every machine of a cluster.
     run.add_argument("folder", type=lambda path: pathlib.Path(path).resolve(), help="output folder")
     run.set_defaults(default_seeds=SEEDS)  # apart from --seeds, which shows whether it was given
-    run.add_argument("--suite", help="atari100k, atari100k-5, minatar, classic, smoke, smoke-atari, or one from --suite-file")
+    run.add_argument("--suite", help=f"{SUITES}, or one from --suite-file")
     run.add_argument("--suite-file", type=pathlib.Path, help="a YAML file with suites of your own")
     run.add_argument(
         "--agents", nargs="+", help="such as eqr_qrdqn, eqr_qrdqn:off (without EqR), qrdqn:stock, eqr_rainbow:se2+aet"

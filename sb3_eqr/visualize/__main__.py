@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
 
         record(model, env, folder / "play", depth=args.depth, seed=args.seed, deterministic=args.deterministic)
     print(diagnostics.summary)
-    table = tables["transition"][["steps_ahead", "loss", "loss_shuffled", "loss_still"]]
+    table = tables["transition"][["steps_ahead", "projection_error", "projection_shuffled", "projection_still"]]
     print(table.to_string(index=False, float_format="{:.2g}".format))
     print(f"Written: {folder}")
 

@@ -16,7 +16,7 @@ PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
     "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
-    "than both. Train longer, with aet_coef above 0. Where a step moves the state little, standing still is hard to beat. "
+    "than both. Train longer, or raise aet_coef. Where a step moves the state little, standing still is hard to beat. "
     "The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",

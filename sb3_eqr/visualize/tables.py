@@ -58,11 +58,10 @@ def _per_step(columns: dict[str, np.ndarray]) -> pd.DataFrame:
 
 
 def _transition(diagnostics: Diagnostics) -> pd.DataFrame:
-    latent, loss = diagnostics.transition._asdict(), diagnostics.loss._asdict()
-    del latent["n_windows"]
-    n_windows = loss.pop("n_windows")
-    projected = {"loss" if name == "error" else f"loss_{name}": values for name, values in loss.items()}
-    return _per_step({"windows": n_windows, **latent, **projected})
+    columns = {"windows": diagnostics.loss.n_windows}
+    for kind, errors in {"projection": diagnostics.loss, "latent": diagnostics.transition}.items():
+        columns |= {f"{kind}_{name}": values for name, values in errors._asdict().items() if name != "n_windows"}
+    return _per_step(columns)
 
 
 def _motion(diagnostics: Diagnostics, actions: Sequence[str]) -> pd.DataFrame:

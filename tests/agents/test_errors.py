@@ -194,7 +194,9 @@ def test_observations_of_predict_must_be_finite(make, value, dtype):
 
 def test_a_bad_first_observation_is_not_stored(make):
     model = make(PoisonEnv("reset"))
-    with pytest.raises(ValueError, match=r"step 1: obs must be finite, got nan.*Nothing was stored\. .*VecCheckNan"):
+    with pytest.raises(
+        ValueError, match=r"step 1: obs must be finite, got nan at \[0.*\]\. Nothing was stored\. .*VecCheckNan"
+    ):
         model.learn(10)
     assert model.replay_buffer.size() == 0
 

@@ -136,12 +136,16 @@ def test_options_can_be_abbreviated_as_in_rl_zoo(sb3_eqr, tmp_path):
         ("eqr_qrdqn", "SlidingBall-v0", "default-image", "CnnPolicy"),
         ("eqr_rainbow", "SmallImages-v0", "default-small-image", "CnnPolicy"),
         ("eqr_rainbow", "Dicts-v0", "default-dict", "MultiInputPolicy"),
+        ("eqr_sac", "SmallImagesBox-v0", "default-small-image", "CnnPolicy"),
     ],
 )
 def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     sb3_eqr, register, tmp_path, algo, env_id, name, policy
 ):
     register("SmallImages-v0", lambda: ImageEnv((10, 10, 3)))
+    register(
+        "SmallImagesBox-v0", lambda: gym.wrappers.TransformAction(ImageEnv((10, 10, 3)), len, gym.spaces.Box(-1, 1, (1,)))
+    )
     register("Dicts-v0", lambda: gym.wrappers.TimeLimit(DictEnv(), 30))
     out = sb3_eqr(f"train --algo {algo} --env {env_id} -n 90 -params learning_starts:40 --eval-freq -1 -f {tmp_path}").out
     assert (f"Using the section {name!r}" in out) == (name != "default")

@@ -62,8 +62,7 @@ def test_every_file_has_the_expected_environments():
     own, stock, continuous = {"eqr_qrdqn", "eqr_rainbow"}, {"stock/dqn", "stock/qrdqn"}, {"eqr_sac", "eqr_tqc"}
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS | GENERIC} == own
     assert {name for name, entries in ENTRIES.items() if entries.keys() == ENVIRONMENTS} == stock
-    generic = GENERIC - {"default-small-image"}
-    assert all(ENTRIES[name].keys() == CONTINUOUS | generic for name in continuous)
+    assert all(ENTRIES[name].keys() == CONTINUOUS | GENERIC for name in continuous)
     minatar = {"atari", *(env_id for env_id in ENVIRONMENTS if env_id.startswith("MinAtar/"))}
     rivals = {"qrdqn", "rainbow", "spr"}
     for name in rivals:

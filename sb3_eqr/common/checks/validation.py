@@ -45,15 +45,16 @@ def environment_errors(step: int) -> Iterator[None]:
 
 def find_infinite(values: np.ndarray | dict[str, np.ndarray] | None) -> str | None:
     """
-    Return the first NaN or infinity of an array, or of a dictionary of arrays together with its key, or ``None``. Numbers
-    beyond the range of float32, in which they are stored, count as infinite.
+    Return the first NaN or infinity of an array, or of a dictionary of arrays, with its key and its index, or ``None``.
+    Numbers beyond the range of float32, in which they are stored, count as infinite.
     """
     for key, array in values.items() if isinstance(values, dict) else [("", values)]:
         array = np.asarray(array)
         if np.issubdtype(array.dtype, np.floating):
             is_held = np.isfinite(array) if array.dtype.itemsize <= 4 else np.abs(array) <= LARGEST
             if not is_held.all():
-                return f"{array[~is_held].flat[0]}{f' of {key!r}' if key else ''}"
+                where = tuple(np.argwhere(~is_held)[0].tolist())
+                return f"{array[where]}{f' of {key!r}' if key else ''}{f' at {list(where)}' if where else ''}"
     return None
 
 

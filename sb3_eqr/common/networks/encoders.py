@@ -135,8 +135,8 @@ class ImageExtractor(BaseFeaturesExtractor):
             raise ValueError(
                 f"Images must be (channels, height, width) with at least {smallest}x{smallest} pixels, got "
                 f"{observation_space.shape}. "
-                "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])), "
-                "and no augmentation: docs/own_environment.md."
+                "Pass smaller filters, such as policy_kwargs=dict(features_extractor_kwargs=dict(layers=[[16, 3, 1]])): "
+                '"Small images" in docs/own_environment.md.'
             )
         trunk = make_trunk(channels)
         with th.no_grad():
