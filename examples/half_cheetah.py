@@ -91,7 +91,7 @@ def draw_curves(axes: Any, curves: dict[str, tuple[list[int], list[float]]], ste
             scores = np.array([row["score"] for row in runs])
             band = scores.min(axis=0), scores.max(axis=0)
             axes.fill_between(runs[0]["step"], *band, color=look.color, alpha=0.15, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel="return while learning", xlim=(0, steps), xticks=range(0, steps + 1, 5_000))
+    axes.set(xlabel="training steps", ylabel="return in training", xlim=(0, steps), xticks=range(0, steps + 1, 5_000))
     axes.legend(loc="upper left")
     axes.grid()
 

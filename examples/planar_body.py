@@ -65,7 +65,7 @@ def draw(file: pathlib.Path, model: EqRSAC) -> None:
         figure, panels = plt.subplots(2, 1, figsize=(3.9, 4.8), layout="constrained")
         for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
             for k, values in enumerate(angles(model, axis).T):
-                panel.plot(COMMANDS, values, color=COLORS[k], label=f"block {k + 1}")
+                panel.plot(COMMANDS, values, color=COLORS[k], label=f"block {k}")
             panel.plot(COMMANDS, sign * TURN * COMMANDS * (axis == 1), color="black", linestyle=":", label="the body")
             panel.set(xlabel=f"command: {name}", ylim=(-1.1 * TURN, 1.1 * TURN))
         figure.supylabel("angle of κ(a), radians", fontsize="medium")

@@ -21,7 +21,7 @@ class LatentCallback(BaseCallback):
     Callback for diagnosing the latent model of an EqR agent during training, on windows from its replay buffer.
 
     It logs, under ``latent/``: ``skill`` and ``gain``, the fractions by which the rollout's error is below that of shuffled
-    targets and of standing still (with the trained distance, over all steps ahead); ``effective_rank``, ``spread`` and
+    targets and of no motion (with the trained distance, over all steps ahead); ``effective_rank``, ``spread`` and
     ``dead_units`` of the encoder; mean ``specificity`` and ``redundancy`` of the blocks; ``symmetry_distance``, the
     distance of the GET loss; ``reward_explained``; and ``blocks``, a figure of the blocks, coloured by age. See
     :func:`~sb3_eqr.visualize.diagnostics.diagnose`. Metrics that are undefined for an agent are not logged.

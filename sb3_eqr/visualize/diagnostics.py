@@ -14,9 +14,9 @@ from sb3_eqr.visualize.measures import Rewards, Transition, mean_of_known
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
-    "predicts": "The latent model predicts: {errors}{unless}. Whether this raises returns, only runs without EqR show.",
+    "predicts": "The latent model predicts: {errors}{unless}. Only a comparison with runs without EqR shows whether this raises returns.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
-    "than both. Train longer, or raise aet_coef. Where a step moves the state little, standing still is hard to beat. "
+    "than both. Train longer, or raise aet_coef. Where a step moves the state little, no motion is hard to beat. "
     "The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",
@@ -60,7 +60,7 @@ class Diagnostics(NamedTuple):
         steps = "one step" if len(self.loss.error) == 1 else f"{len(self.loss.error)} steps"
         errors = (
             f"over {steps}, its error is {_lower(skill)} than with shuffled targets and {_lower(gain)} "
-            f"than when standing still ({_lower(latent_skill)} and {_lower(latent_gain)} between latent states, before the "
+            f"than with no motion ({_lower(latent_skill)} and {_lower(latent_gain)} between latent states, before the "
             "projection)"
         )
         unless = UNLESS if latent_gain < PREDICTS else ""
@@ -124,7 +124,7 @@ def diagnose(model: EqROffPolicy, play: Play, seed: int = 0) -> Diagnostics:
 
 def find_verdict(loss: Transition, is_trained: bool = True) -> str:
     """
-    - "predicts": the rollout removes at least a quarter of the error of shuffled targets, and of that of standing still.
+    - "predicts": the rollout removes at least a quarter of the error of shuffled targets, and of that of no motion.
       An untrained agent whose states differ may achieve the first, since its κ moves them little, but not the second.
     - "not trained": otherwise, if no loss trains the latent model.
     - "collapsed": otherwise, if the shuffled error, Var[ẑ] + Var[z] + ‖mean ẑ − mean z‖², is below 10⁻³: all states are

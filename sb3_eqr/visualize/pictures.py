@@ -59,7 +59,7 @@ def write_pictures(figures: dict[str, Figure], folder: pathlib.Path) -> None:
 
 
 def transition_figure(diagnostics: Diagnostics) -> Figure:
-    """Errors of the rollout per step ahead, compared with those of shuffled targets and of standing still."""
+    """Errors of the rollout per step ahead, compared with those of shuffled targets and of no motion."""
     figure = Figure(figsize=SIZE, layout="constrained")
     left, right = figure.subplots(1, 2)
     _errors(left, diagnostics.transition, "of latent states x̂, x")
@@ -72,7 +72,7 @@ def transition_figure(diagnostics: Diagnostics) -> Figure:
 
 
 def _errors(ax: Axes, errors: Transition, title: str) -> None:
-    named = {"predicted": errors.error, "shuffled targets": errors.shuffled, "standing still": errors.still}
+    named = {"predicted": errors.error, "shuffled targets": errors.shuffled, "no motion": errors.still}
     _lines(ax, named)
     ax.set_title(title, loc="left")
     if max(np.nanmax(values, initial=0) for values in named.values()) > 0:
