@@ -14,7 +14,8 @@ from sb3_eqr.visualize.measures import Rewards, Transition, mean_of_known
 MAX_STATES = 256  # in which κ is computed for every action: enough for a table of means
 PREDICTS = 0.25  # minimum skill and minimum gain
 SENTENCES = {
-    "predicts": "The latent model predicts: {errors}{unless}. Only a comparison with runs without EqR shows whether this raises returns.",
+    "predicts": "The latent model predicts: {errors}{unless}. Only a comparison with runs without EqR shows whether this "
+    "raises returns.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
     "than both. Train longer, or raise aet_coef. Where a step moves the state little, no motion is hard to beat. "
     "The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
