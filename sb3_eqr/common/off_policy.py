@@ -37,10 +37,8 @@ class EqROffPolicy(FiniteData, SafeFiles):
     reward_coef: float
     policy_description: dict[str, str]
     frame_stack = 1
-    reward_mean, reward_scale = (
-        0.0,
-        1.0,
-    )  # of the rewards in the replay buffer, if the reward network's targets are standardised
+    reward_mean = 0.0  # and the standard deviation, by which an actor-critic agent's latent model standardises rewards
+    reward_scale = 1.0
     _monitor: UpdateMonitor
 
     @property
