@@ -58,7 +58,8 @@ def find_agent(text: str) -> Agent:
         return _agent_of_file(algo, pathlib.Path(match[1]).resolve(), match[2])
     name = f"{STOCK}/{algo}" if entries == STOCK else entries
     if name not in files:
-        legal = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
+        ours = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
+        legal = ours if algo in AGENTS else []
         longer = sorted(key for key in legal if key.startswith(entries))
         if len(longer) > 1:
             raise ValueError(
@@ -66,7 +67,8 @@ def find_agent(text: str) -> Agent:
             )
         if not longer:
             legal += [STOCK] * (f"{STOCK}/{algo}" in files) + [OFF] * (algo in AGENTS)
-            raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{nearest_name(entries, legal)}")
+            choices = nearest_name(entries, legal) if legal else f" Use {algo!r} alone, or a YAML file."
+            raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{choices}")
         entries = name = longer[0]
     return Agent(f"{algo}:{entries}", algo, files[name])
 

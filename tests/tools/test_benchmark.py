@@ -179,7 +179,7 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite atari10k --agents dqn", "no suite 'atari10k'. Did you mean 'atari100k'? Choose from atari100k, atari"),
         ("run b --suite atari100k --games Pnog --agents dqn", "suite 'atari100k' has no game 'Pnog'. Did you mean 'Pong'?"),
         ("run b --suite smoke --agents dnq", "there is no algorithm 'dnq'. Did you mean 'dqn'?"),
-        ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no hyperparameters 'stock'. Choose from"),
+        ("run b --suite smoke --agents ppo:stock", "'ppo:stock': there are no hyperparameters 'stock'. Use 'ppo' alone"),
         ("run b --suite smoke --agents sac", "sac does not support discrete actions"),
         ("run b --suite smoke --agents ppo --steps 2001", "steps must be a multiple of n_envs = 8, got 2001"),
         ("run b --suite smoke --agents eqr_rainbow:se2+ate", "no hyperparameters 'se2+ate'. Did you mean 'se2+aet'?"),
