@@ -388,6 +388,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
         ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
         ({"aet_coef": -1.0}, "aet_coef must be a finite number >= 0, got -1.0"),
         ({"aet_coeff": 1.0}, "Did you mean 'aet_coef'"),
+        ({"aux_gradient_share": 1.0}, "Only EqRQRDQN and EqRRainbow take it"),
         ({"learning_starts": None}, "learning_starts must be an integer >= 0, got None"),
         ({"policy_kwargs": {"latent_tau": None}}, "latent_tau must be"),
         ({"policy_kwargs": {"n_block": 3}}, "unexpected argument 'n_block'. Did you mean 'n_blocks'"),

@@ -86,6 +86,7 @@ def check_names(owner: str, given: Iterable[str], legal: Iterable[str], **elsewh
             places = [place for place, taker in elsewhere.items() if name in inspect.signature(taker).parameters]
             places += ["policy_kwargs"] if "policy_kwargs" in elsewhere and name in POLICY else []  # maybe of the other agent
             near = " Did you mean 'symmetry_coef'?" if name == "get_coef" else nearest(name, legal)
+            near = " Only EqRQRDQN and EqRRainbow take it." if "policy_kwargs" in elsewhere and name in ALGORITHM else near
             advice = near or f" It takes {', '.join(one for one in legal if not one.startswith('_'))}."
             advice = f" Pass {places[0]}=dict({name}=...)." if places else advice
             raise TypeError(f"{owner} got an unexpected argument {name!r}.{advice}")
