@@ -30,7 +30,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from experiments import markdown
-from experiments.tables import PARTS, difference, draw, mean_and_error
+from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
@@ -179,15 +179,6 @@ def time_steps(task: str, arms: Sequence[str], rounds: int, is_short: bool) -> s
     milliseconds, ratios = np.median(times, axis=0), np.median(times / times[:, :1], axis=0)
     table = [[arm, f"{time:.1f}", f"{ratio:.2f}"] for arm, time, ratio in zip(arms, milliseconds, ratios, strict=True)]
     return markdown(["arm", "ms per step", f"times {arms[0]}"], table)
-
-
-def area(run: dict[str, Any], after: int = 0, until: float = np.inf) -> float:
-    """The mean return of the episodes that end after one step and until another: each weighs as many steps as it has."""
-    steps, scores, lengths = (np.array(run["training"][key]) for key in ("step", "score", "length"))
-    counted = (steps > after) & (steps <= until)
-    if not counted.any():
-        return np.nan
-    return float(np.average(scores[counted], weights=lengths[counted]))
 
 
 def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[str, Any]]]:

@@ -56,10 +56,14 @@ OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
-SHORT = (("none", "sac"), "2000-12000", "continuous.md#short-runs-with-and-without-noise")  # after the random steps
+EARLY = "area2000-12000", "continuous.md#short-runs-with-more-seeds"  # after the random steps
 COMPARED: list[Arguments] = [
-    ("HalfCheetah, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5"], *SHORT),
-    ("HalfCheetah with noise, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5+noise"], *SHORT),
+    *(
+        (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("none", "sac"), *EARLY)
+        for task in ("HalfCheetah", "Walker2d", "Hopper", "Ant", "Humanoid")
+    ),
+    ("HalfCheetah, EqRTQC", ["continuous_early.xz"], ["HalfCheetah-v5"], ("eqr_tqc", "tqc"), *EARLY),
+    ("HalfCheetah with noise, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5+noise"], ("none", "sac"), *EARLY),
     ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
@@ -125,8 +129,8 @@ MEASURES: dict[str, Callable[[Row], float]] = {
 def measure(row: Row, name: str) -> float:
     """
     :param name: a key of ``MEASURES``; "20000-40000", the mean return of the training episodes that ended in these steps;
-        "at475", the step of the first evaluation of at least 475; "until10000", the mean of the evaluations up to this step;
-        or "train/KEY", the last value of a logged key
+        "area20000-40000", the same with episodes weighted by their lengths; "at475", the step of the first evaluation of at
+        least 475; "until10000", the mean of the evaluations up to this step; or "train/KEY", the last value of a logged key
     :return: its value, NaN if the run does not have it; what was measured when the run was made comes first
     """
     if name in row.get("measures", {}):
@@ -141,10 +145,21 @@ def measure(row: Row, name: str) -> float:
         if name.startswith("until"):
             return float(scores[steps <= limit].mean())
         return float(min(steps[scores >= limit], default=np.nan))
-    first, end = map(int, name.split("-"))
+    first, end = map(int, name.removeprefix("area").split("-"))
+    if name.startswith("area"):
+        return area(row, first, end)
     steps, scores = np.array(row["training"]["step"]), np.array(row["training"]["score"])
     found = scores[(first < steps) & (steps <= end)]
     return float(np.mean(found)) if len(found) and row.get("stopped_at", end) >= end else np.nan
+
+
+def area(run: Row, after: int = 0, until: float = np.inf) -> float:
+    """The mean return of the episodes that end after one step and until another: each weighs as many steps as it has."""
+    steps, scores, lengths = (np.array(run["training"][key]) for key in ("step", "score", "length"))
+    counted = (steps > after) & (steps <= until)
+    if not counted.any():
+        return np.nan
+    return float(np.average(scores[counted], weights=lengths[counted]))
 
 
 def text(value: float) -> str:
