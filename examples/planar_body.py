@@ -67,7 +67,7 @@ def draw(file: pathlib.Path, model: EqRSAC) -> None:
             for k, values in enumerate(angles(model, axis).T):
                 panel.plot(COMMANDS, values, color=COLORS[k], label=f"block {k}")
             panel.plot(COMMANDS, sign * TURN * COMMANDS * (axis == 1), color="black", linestyle=":", label="the body")
-            panel.set(xlabel=f"command: {name}", ylim=(-1.1 * TURN, 1.1 * TURN))
+            panel.set(xlabel=f"command: {name}", ylim=(-1.5 * TURN, 1.5 * TURN))
         figure.supylabel("angle of κ(a), radians", fontsize="medium")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
         figure.savefig(file, dpi=200)
