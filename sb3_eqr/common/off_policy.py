@@ -37,7 +37,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
     reward_coef: float
     policy_description: dict[str, str]
     frame_stack = 1
-    reward_mean = 0.0  # and the standard deviation, by which an actor-critic agent's latent model standardises rewards
+    reward_mean = 0.0  # which the reward network's targets are standardised by: mean and standard deviation
     reward_scale = 1.0
     _monitor: UpdateMonitor
 

@@ -319,7 +319,7 @@ def test_a_loaded_replay_buffer_replaces_the_models(model, tmp_path):
 
 
 def test_a_replay_buffer_of_another_size_and_several_environments_loads(make, tmp_path):
-    """Eight transitions of each of eight environments, the number of its environments, in place of sixteen."""
+    """Eight environments, and eight transitions of each in the buffer that loads, sixteen in the saved one."""
     large, small = (make(make_vec_env(ChainEnv, 8), buffer_size=np.int64(8 * n), learning_starts=200) for n in (16, 8))
     large.learn(64).save_replay_buffer(tmp_path / "buffer")
     with pytest.warns(UserWarning, match="saved at step 64"):
