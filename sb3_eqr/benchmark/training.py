@@ -23,9 +23,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import get_device, should_collect_more_steps
+from stable_baselines3.common.utils import should_collect_more_steps
 
-from sb3_eqr import DISCRETE
 from sb3_eqr.benchmark.agents import WORLD
 from sb3_eqr.benchmark.evaluation import evaluate
 from sb3_eqr.benchmark.runs import ERROR, LOCK, MODELS, PROGRESS, RESULT, STARTS, STOPPED, Run, Settings, write_json
@@ -185,8 +184,6 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
     with tempfile.TemporaryDirectory() as aside, contextlib.redirect_stdout(io.StringIO()):  # RL Zoo prints
         config = pathlib.Path(aside) / "entry.yml"
         entry = {key: value for key, value in run.entry.items() if value is not None or key not in WORLD}  # null: none
-        if run.agent.algo in DISCRETE and get_device(settings.device).type == "cuda":
-            entry = {"cuda_graph": True, **entry}
         config.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
         manager = ExperimentManager(
             args,

@@ -22,7 +22,7 @@ SENTENCES = {
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
-    'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive").',
+    'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive", predictor=False).',
 }
 UNLESS = '. To use the latent states themselves, train with policy_kwargs=dict(projection="none")'
 COLLAPSED = 1e-3  # squared distance on the unit sphere: directions within two degrees of each other

@@ -8,7 +8,6 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 import yaml
 from filelock import FileLock
 from rl_zoo3.utils import create_test_env, get_saved_hyperparams
@@ -393,16 +392,6 @@ def test_a_run_is_stopped_after_a_time_and_continues(tmp_path, monkeypatch):
     assert stopped.state().name == "waiting" and stopped.state().step == 80
     assert execute(stopped, Settings(stop_at=time.time() + 600)) == "finished"
     assert scores_of(stopped) == scores_of(undisturbed) and not (stopped.folder / STOPPED).exists()
-
-
-@pytest.mark.parametrize("device, expected", [("cuda", True), ("cpu", None)])
-def test_our_agents_capture_their_updates_on_a_gpu(tmp_path, monkeypatch, device, expected):
-    asked = {}
-    monkeypatch.setattr(training, "get_device", th.device)
-    monkeypatch.setattr(training.yaml, "safe_dump", lambda entry: asked.update(entry["CartPole-v1"]) or "{}")
-    with pytest.raises((ValueError, SystemExit, KeyError)):
-        training.build(make_run(tmp_path, "eqr_rainbow"), Settings(device=device), tmp_path)
-    assert asked.get("cuda_graph") is expected
 
 
 @pytest.mark.parametrize("algo, n_updates", [("eqr_rainbow", 30), ("qrdqn", 30), ("ppo", 5)])
