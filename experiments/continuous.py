@@ -52,7 +52,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "sac_two_updates": {"gradient_steps": 2},
     "none": {},
     "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
-    "t72": {"policy_kwargs": {"group": "T(72)"}},  # as many, without rotation
+    "t72": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1}},  # as many, without rotation
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},
