@@ -56,7 +56,7 @@ OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
-EARLY = "area2000-12000", "continuous.md#short-runs-with-more-seeds"  # after the random steps
+EARLY = "area2000-12000", "continuous.md#in-12000-steps"  # after the random steps
 COMPARED: list[Arguments] = [
     *(
         (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("none", "sac"), *EARLY)
