@@ -23,6 +23,23 @@ def test_normalized_distance_by_hand():
     th.testing.assert_close(normalized_distance(a, b), th.tensor([0.0, 2.0, 4.0, 1.0]))
 
 
+def test_normalized_distance_is_that_of_unit_vectors():
+    """Value and gradient, also of nearly equal directions, short and long vectors, in float64 by the definition."""
+    rng = np.random.default_rng(0)
+    for size, noise in ((1.0, 1.0), (1e-6, 1e-3), (1e4, 1e-3)):
+        wanted = rng.normal(size=(50, 2, 16))
+        given = size * (wanted + noise * rng.normal(size=wanted.shape))
+        found, answers = [], []
+        for dtype in (th.float32, th.float64):
+            y, target = th.tensor(given, dtype=dtype, requires_grad=True), th.tensor(wanted, dtype=dtype)
+            units = [x / x.norm(dim=-1, keepdim=True) for x in (y, target)]
+            distance = normalized_distance(y, target) if dtype == th.float32 else (units[0] - units[1]).pow(2).sum(dim=-1)
+            (gradient,) = th.autograd.grad(distance.sum(), y)
+            (found if dtype == th.float32 else answers).extend([distance.double(), size * gradient.double()])
+        th.testing.assert_close(found[0], answers[0], rtol=1e-5, atol=1e-6)
+        th.testing.assert_close(found[1], answers[1], rtol=1e-4, atol=1e-6)
+
+
 def test_contrastive_loss_by_hand():
     one, two = th.tensor([1.0, 0.0]), th.tensor([0.0, 3.0])
     target = th.stack([one, two])[:, None]  # (2, 1, 2): a right angle apart
