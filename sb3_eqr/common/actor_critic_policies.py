@@ -200,7 +200,7 @@ class EqRActorCriticPolicy(BasePolicy):
     """
     Mixin, listed before a policy of SB3 with an actor and critics. It adds the encoder, the latent model, their moving
     averages and the optimiser of both; actor and critics read them through a :class:`LatentReader`, and the critics
-    κ(x, a) · x, too.
+    κ(x, a) · x, too, which is κ(x, a) without a group.
 
     :param observation_space: Observation space
     :param action_space: Action space

@@ -19,8 +19,8 @@ class EqRSAC(EqRActorCritic, SAC):
     Papers: Haarnoja et al., https://arxiv.org/abs/1801.01290; the latent model and its losses are those of Mondal et al., EqR:
     Equivariant Representations for Data-Efficient Reinforcement Learning (ICML 2022).
 
-    Before each update of SAC, the latent model makes one of its own. Actor and critics also read the latent state, the critics
-    κ(x, a) · x, too: see :class:`~sb3_eqr.common.actor_critic_policies.EqRActorCriticPolicy`.
+    Before each update of SAC, the latent model makes one of its own. Actor and critics also read the latent state, and the
+    critics the predicted next one: see :class:`~sb3_eqr.common.actor_critic_policies.EqRActorCriticPolicy`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -18,6 +18,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+import tempfile
 import warnings
 from types import SimpleNamespace
 
@@ -69,9 +70,16 @@ def check_sh(example):
 
 
 def check_yaml(example):
-    """Hyperparameters have the key ``policy``, suites the key ``games``."""
+    """Hyperparameters have the key ``policy``, suites the key ``games``, changes of another file ``base`` and ``changes``."""
     register()  # RL Zoo knows our agents only then
-    for name, entry in yaml.safe_load(example.parsed).items():
+    found = yaml.safe_load(example.parsed)
+    if "base" in found:
+        with tempfile.NamedTemporaryFile("w", suffix=".yml") as file:
+            file.write(example.parsed)
+            file.flush()
+            assert find_agent(f"eqr_rainbow:{file.name}").changes == found["changes"]
+        return
+    for name, entry in found.items():
         if "games" in entry:
             make_suite(name, "docs", entry)
         else:
