@@ -15,8 +15,7 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
 
     The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRQRDQN.__init__)``). The
     defaults are the paper's values for Atari 100K (Table 5), except for those of docs/gradients.md, "Which defaults matter",
-    and where QR-DQN differs: 51 quantiles replace the 51 atoms on [-10, 10],
-    and the priority of a sample is its quantile loss.
+    and where QR-DQN differs: 51 quantiles replace the 51 atoms on [-10, 10], and the priority is the quantile loss.
 
     ``policy_kwargs`` sets the group, the number of blocks, dueling and noisy layers, see
     :class:`~sb3_eqr.eqr_qrdqn.policies.EqRQRDQNPolicy`.
