@@ -9,13 +9,14 @@ from typing import Any, Self
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_normalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import check, number
+from sb3_eqr.common.checks.arguments import check, nearest, number
 from sb3_eqr.common.checks.finite_data import FiniteData
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
@@ -58,6 +59,12 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         raise NotImplementedError
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:  # type: ignore[attr-defined]
+            aliases = list(self.policy_aliases)  # type: ignore[attr-defined]
+            raise ValueError(f"policy must be one of {aliases}, got {policy_name!r}.{nearest(policy_name, aliases)}")
+        return super()._get_policy_from_name(policy_name)  # type: ignore[misc]
 
     @classmethod
     def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:

@@ -39,7 +39,7 @@ from tests.toys import ChainEnv, ImageEnv, IntegerEnv, PoisonEnv, SampledEnv
         ({"replay_buffer_kwargs": {"buffer_size": 3}}, "Pass buffer_size=3 to EqR"),
         ({"policy": QRDQNPolicy}, "policy must be derived from EqR(QRDQN|Rainbow)Policy"),
         ({"policy": "MultiInputPolicy"}, "observation_space must be a Dict space"),
-        ({"policy": "LstmPolicy"}, "LstmPolicy unknown"),
+        ({"policy": "MLPPolicy"}, "policy must be one of .*got 'MLPPolicy'. Did you mean 'MlpPolicy'"),
         ({"policy_kwargs": {"group": "SU(2)"}}, "group must be GL\\(n\\), SE\\(n\\).*got 'SU\\(2\\)'"),
         ({"policy_kwargs": {"group": "SO(1)"}}, "n is at least 2 for SO"),
         ({"policy_kwargs": {"group": 2}}, "group must be GL\\(n\\), SE\\(n\\).*got 2"),

@@ -151,7 +151,7 @@ def check_continuous_actions(action_space: spaces.Space) -> None:
     if not isinstance(action_space, spaces.Box):
         raise AssertionError(
             f"The algorithm only supports {spaces.Box} as action space, but {action_space} was provided. "
-            "Use EqRQRDQN or EqRRainbow for a Discrete one."
+            "Use EqRQRDQN or EqRRainbow for a Discrete one; no agent has MultiDiscrete or MultiBinary actions."
         )
 
 
@@ -235,7 +235,8 @@ def check_replay(owner: str, chosen: Any, base: type, kwargs: dict[str, Any], se
     """Raise ValueError if the class is not derived from ``base``, or ``kwargs`` contains arguments that the algorithm sets."""
     if chosen is not None and not (isinstance(chosen, type) and issubclass(chosen, base)):
         raise ValueError(
-            f"replay_buffer_class must be {base.__name__} or a class derived from it, got {chosen}. Leave it out."
+            f"replay_buffer_class must be {base.__name__} or a class derived from it, got {chosen}. "
+            "Leave it out; there is no HER."
         )
     for name in (*set_by_owner, *OF_ENV):
         if name in kwargs:
