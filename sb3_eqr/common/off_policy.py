@@ -4,7 +4,7 @@ import copy
 import inspect
 import io
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch as th
 from gymnasium import spaces
@@ -30,6 +30,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
     """Mixin, listed before an off-policy algorithm of SB3, for an agent with a latent model that learns from windows."""
 
     policy: Any
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
     replay_buffer: SequenceReplayBuffer | None
     replay_buffer_class: type[SequenceReplayBuffer] | None
     prediction_depth: int
@@ -61,8 +62,8 @@ class EqROffPolicy(FiniteData, SafeFiles):
         raise NotImplementedError
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        if policy_name not in self.policy_aliases:  # type: ignore[attr-defined]
-            aliases = list(self.policy_aliases)  # type: ignore[attr-defined]
+        if policy_name not in self.policy_aliases:
+            aliases = list(self.policy_aliases)
             raise ValueError(f"policy must be one of {aliases}, got {policy_name!r}.{nearest(policy_name, aliases)}")
         return super()._get_policy_from_name(policy_name)  # type: ignore[misc]
 
