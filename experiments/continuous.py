@@ -54,6 +54,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
     "t72": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1}},  # as many, without rotation
     "lean": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1, "reads_features": False}},
+    "lean_64": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1, "reads_features": False}, "latent_batch_size": 64},
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},

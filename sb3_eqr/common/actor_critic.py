@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments, integer
+from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.networks.optimizers import assign_gradients
 from sb3_eqr.common.objective import LatentObjective, keep_freed_memory
@@ -22,6 +22,7 @@ from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 RULES = {
     **ALGORITHM,
     "learning_starts": integer(0),
+    "latent_batch_size": integer(2) | NONE,
     "target_update_interval": integer(1),
     "top_quantiles_to_drop_per_net": integer(0),  # of TQC
 }
@@ -49,6 +50,7 @@ class EqRActorCritic(EqROffPolicy):
         aet_coef: float,
         symmetry_coef: float,
         reward_coef: float,
+        latent_batch_size: int | None,
         policy_kwargs: dict[str, Any] | None,
         _init_setup_model: bool,
         **kwargs: Any,
@@ -62,6 +64,7 @@ class EqRActorCritic(EqROffPolicy):
         self.aet_coef = aet_coef
         self.symmetry_coef = symmetry_coef
         self.reward_coef = reward_coef
+        self.latent_batch_size = latent_batch_size
         self.policy_description: dict[str, str] = {}  # saved with the model
         if _init_setup_model:
             self._setup_model()
@@ -93,7 +96,7 @@ class EqRActorCritic(EqROffPolicy):
         return result
 
     def _check_losses(self) -> None:
-        validation.check_losses(1.0, self.depth, self.batch_size, self.gamma, None)
+        validation.check_losses(1.0, self.depth, self.latent_batch_size or self.batch_size, self.gamma, None)
         self.policy.check_losses(self.depth, self.symmetry_coef)
 
     def _setup_model(self) -> None:
@@ -141,7 +144,7 @@ class EqRActorCritic(EqROffPolicy):
             self._find_reward_scale(buffer, gradient_steps)
             policy.set_training_mode(True)
             update_learning_rate(policy.latent_optimizer, self.lr_schedule(self._current_progress_remaining))
-            self.replay_buffer = BeforeSamples(buffer, self._update_latent_model)  # type: ignore[assignment]
+            self.replay_buffer = BeforeSamples(buffer, self._update_latent_model, self.latent_batch_size or batch_size)  # type: ignore[assignment]
         if policy.has_latent:
             policy.reader.remembers = True
         try:
@@ -193,18 +196,19 @@ def moments(rewards: np.ndarray) -> tuple[float, float]:
 
 class BeforeSamples:
     """
-    A replay buffer for one round of updates; each call of ``sample`` first passes windows of its own to a function, then draws
-    transitions without rollouts.
+    A replay buffer for one round of updates; each call of ``sample`` first passes ``n_windows`` windows of its own to a
+    function, then draws transitions without rollouts.
     """
 
-    def __init__(self, buffer: SequenceReplayBuffer, function: Callable[[SequenceReplayBufferSamples], None]):
+    def __init__(self, buffer: SequenceReplayBuffer, function: Callable[[SequenceReplayBufferSamples], None], n_windows: int):
         self._buffer = buffer
         self._function = function
+        self._n_windows = n_windows
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
         """As that of the buffer."""
         buffer = self._buffer
-        self._function(buffer.sample(batch_size, env))
+        self._function(buffer.sample(self._n_windows, env))
         depth, buffer.prediction_depth = buffer.prediction_depth, 0
         try:
             return buffer.sample(batch_size, env)

@@ -58,6 +58,7 @@ class EqRTQC(EqRActorCritic, TQC):
         aet_coef: float = 1.0,
         symmetry_coef: float = 0.0,
         reward_coef: float = 1.0,
+        latent_batch_size: int | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -67,13 +68,14 @@ class EqRTQC(EqRActorCritic, TQC):
         _init_setup_model: bool = True,
     ):
         """
-        Parameters and defaults are those of SB3-Contrib's TQC, and the next four. ``policy_kwargs`` has more keys,
+        Parameters and defaults are those of SB3-Contrib's TQC, and the next five. ``policy_kwargs`` has more keys,
         ``replay_buffer_class`` must be a :class:`~sb3_eqr.SequenceReplayBuffer`, ``optimize_memory_usage`` has no effect.
 
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: weight ≥ 0 of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: weight ≥ 0 of the group-equivariant transition loss; 0 disables it
         :param reward_coef: weight ≥ 0 of the loss of the standardised rewards; 0 disables it
+        :param latent_batch_size: number ≥ 2 of windows in an update of the latent model; None: ``batch_size``
         :raises ValueError: if an argument is out of range
         :raises TypeError: if an argument is unknown; the message suggests the nearest name
         """

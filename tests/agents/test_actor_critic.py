@@ -210,10 +210,10 @@ def test_the_algorithm_draws_as_without_a_latent_model(agent):
     model = make(agent).learn(60)
     buffer, latent = model.replay_buffer, []
     random_state = np.random.get_state()
-    second = BeforeSamples(buffer, latent.append).sample(8)
-    assert latent[0].rollout_observations.shape == (8, 2, 3) and second.rollout_observations is None
+    second = BeforeSamples(buffer, latent.append, 6).sample(8)
+    assert latent[0].rollout_observations.shape == (6, 2, 3) and second.rollout_observations is None
     np.random.set_state(random_state)
-    buffer.sample(8)
+    buffer.sample(6)
     buffer.prediction_depth = 0
     assert all(th.equal(a, b) for a, b in zip(second[:5], buffer.sample(8)[:5], strict=True))
 
@@ -296,12 +296,13 @@ def test_the_learning_rate_of_the_latent_model_follows_the_schedule(agent):
 
 
 @EACH
-def test_one_update_by_hand(agent):
+@pytest.mark.parametrize("n_windows", [None, 5])
+def test_one_update_by_hand(agent, n_windows):
     """Losses by their definitions, Adam's first step, and the moving average, for windows that do not reach an end."""
-    model = make(agent, learning_starts=100, learning_rate=1e-3).learn(100)
+    model = make(agent, learning_starts=100, learning_rate=1e-3, latent_batch_size=n_windows).learn(100)
     policy, before = model.policy, tensors(model)
     np.random.seed(5)
-    samples = model.replay_buffer.sample(8)
+    samples = model.replay_buffer.sample(n_windows or 8)
     rewards = (samples.rollout_rewards - model.replay_buffer.rewards[:100].mean()) / model.replay_buffer.rewards[:100].std()
     policy.set_training_mode(True)
     latent, target = policy.latent_model, policy.latent_target
@@ -386,6 +387,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
         ({"policy_kwargs": {"group": "none", "n_blocks": None}, "symmetry_coef": 1.0}, "must have inverses for the GET loss"),
         ({"replay_buffer_class": PrioritizedSequenceReplayBuffer}, "must sample uniformly"),
         ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
+        ({"latent_batch_size": 1}, "latent_batch_size must be an integer >= 2 or None, got 1"),
         ({"aet_coef": -1.0}, "aet_coef must be a finite number >= 0, got -1.0"),
         ({"aet_coeff": 1.0}, "Did you mean 'aet_coef'"),
         ({"aux_gradient_share": 1.0}, "Only EqRQRDQN and EqRRainbow take it"),
