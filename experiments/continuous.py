@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ContinuousCritic
@@ -45,7 +45,7 @@ SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHO
 SHORT_NETWORK = {"net_arch": [128, 128]}
 NARROW_READ: dict[str, Any] = {"latent_hidden_dim": 128, "features_extractor_kwargs": {"features_dim": 128}}
 NARROW = {**NARROW_READ, "reads_features": False}
-OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "eqr_tqc": EqRTQC}
+OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC}
 # name -> arguments of these, or of EqRSAC, whose defaults are those of "none"
 ARMS: dict[str, dict[str, Any]] = {
     **{name: {} for name in OTHERS},
@@ -134,7 +134,7 @@ def nearest_torque(action: np.ndarray) -> int:
     return round((float(action[0]) + 1) / 2 * (N_TORQUES - 1))
 
 
-def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC:
+def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | CrossQ:
     """An agent at RL Zoo's settings, or with small networks that learn in short runs."""
     given = dict(ARMS[arm])
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
