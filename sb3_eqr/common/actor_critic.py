@@ -146,13 +146,13 @@ class EqRActorCritic(EqROffPolicy):
             update_learning_rate(policy.latent_optimizer, self.lr_schedule(self._current_progress_remaining))
             self.replay_buffer = BeforeSamples(buffer, self._update_latent_model, self.latent_batch_size or batch_size)  # type: ignore[assignment]
         if policy.has_latent:
-            policy.reader.remembers = True
+            policy.reader.is_updating = True
         try:
             super().train(gradient_steps, batch_size)  # type: ignore[misc]
         finally:
             self.replay_buffer = buffer
             if policy.has_latent:
-                policy.reader.remembers = False
+                policy.reader.is_updating = False
                 policy.reader.forget()
 
     def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:

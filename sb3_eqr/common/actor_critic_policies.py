@@ -95,13 +95,13 @@ class ActorCriticOptions(LatentOptions):
 class LatentReader(BaseFeaturesExtractor):
     """
     What actor and critics read of observations: [s, h(s), x] of vectors, [h(s), x] of all others, or the same without h(s).
-    h and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In train mode,
-    observations are augmented; in a round of updates, those of one batch are encoded only once, for actor and critics alike.
+    h and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In a round of
+    updates, observations are augmented, and those of one batch are encoded only once, for actor and critics alike.
 
     :param observation_space: of the observations
     :param encoder: the moving average of the encoder, h
     :param latent_model: the moving average of the latent model
-    :param augment: in train mode; otherwise observations are only preprocessed
+    :param augment: in a round of updates; otherwise observations are only preprocessed
     :param reads_features: whether h(s) is among what they read
     """
 
@@ -121,19 +121,18 @@ class LatentReader(BaseFeaturesExtractor):
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
         self._augment = augment
         self._plain = Augmentation(observation_space, augment._normalize_images, 0, 0.0)
-        self.remembers = False  # during a round of updates
+        self.is_updating = False  # during a round of updates
         self._known: list[tuple[PyTorchObs, th.Tensor]] = []
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """Map observations as they come from the environment, (B, *obs_shape) or a dict of these, to (B, features_dim)."""
-        if not self.training:
+        if not (self.is_updating and self.training):
             return self._read(self._plain(observations))
         for seen, found in self._known:
             if seen is observations:
                 return found
         found = self._read(self._augment(observations))
-        if self.remembers:
-            self._known = [*self._known[-1:], (observations, found)]  # an update has two batches
+        self._known = [*self._known[-1:], (observations, found)]  # an update has two batches
         return found
 
     @th.no_grad()
@@ -344,6 +343,8 @@ class EqRActorCriticPolicy(BasePolicy):
         if self.has_latent:
             self.encoder.train(mode)
             self.latent_model.train(mode)
+            self.latent_encoder.eval()
+            self.latent_target.eval()
 
     @property
     def description(self) -> dict[str, str]:

@@ -11,6 +11,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_eqr import ExactCheckpointCallback, PrioritizedSequenceReplayBuffer
@@ -451,6 +452,48 @@ def test_float_images_and_other_optimisers(agent):
     env = gym.wrappers.TransformObservation(MoveEnv(IMAGE), lambda image: (image / 255).astype(np.float32), floats)
     model = make(agent, env, "CnnPolicy", policy_kwargs={"normalize_images": False, "optimizer_kwargs": {"foreach": True}})
     assert model.learn(34)._n_updates == 4
+
+
+class Centred(BaseFeaturesExtractor):
+    """An encoder with a statistic of its own, a mask of minus infinity, and a weight that two layers share."""
+
+    def __init__(self, space, features_dim=3):
+        super().__init__(space, features_dim)
+        self.register_buffer("mean", th.zeros(space.shape[0]))
+        self.register_buffer("mask", th.nn.Transformer.generate_square_subsequent_mask(3))
+        self.first, self.second = th.nn.Linear(3, 3), th.nn.Linear(3, 3)
+        self.second.weight = self.first.weight
+
+    def forward(self, observations):
+        if self.training:
+            self.mean.lerp_(observations.mean(dim=0).detach(), 0.1)
+        return self.second(self.first(observations - self.mean))
+
+
+@EACH
+def test_the_average_of_a_custom_encoder(agent, tmp_path):
+    model = make(agent, policy_kwargs={"features_extractor_class": Centred}).learn(60)
+    model.save(tmp_path / "model")
+    encoder, average = model.policy.encoder.trunk, model.policy.latent_encoder.trunk
+    assert encoder.mean.abs().max() > 0 and th.equal(encoder.mean, average.mean)
+    own, before = encoder.first.weight.clone(), average.first.weight.clone()
+    model.policy.target_copy.update(0.5)
+    assert average.second.weight is average.first.weight
+    assert th.allclose(average.first.weight, (own + before) / 2)
+
+
+@EACH
+def test_outside_of_updates_images_are_not_shifted(agent):
+    critic = make(agent, MoveEnv(IMAGE), "CnnPolicy").learn(33).critic.train()
+    images, actions = th.randint(0, 256, (5, 3, 40, 40), dtype=th.uint8), th.rand(5, 2)
+    assert th.equal(critic(images, actions)[0], critic(images, actions)[0])
+
+
+@EACH
+def test_the_average_stays_in_eval_mode(agent):
+    policy = make(agent).learn(60).policy.train()
+    policy.set_training_mode(True)
+    assert policy.latent_model.training and not (policy.latent_encoder.training or policy.latent_target.training)
 
 
 @EACH

@@ -16,18 +16,18 @@ class TargetCopy:
     def __init__(self, pairs: Sequence[tuple[nn.Module, nn.Module]]):
         self.pairs = list(pairs)
         self._parameters: tuple[list[th.Tensor], list[th.Tensor]] | None = None  # of the networks, and of their copies
-        self._statistics: tuple[list[th.Tensor], list[th.Tensor]] = [], []  # those that are copied
+        self._buffers: tuple[list[th.Tensor], list[th.Tensor]] = [], []  # those that are copied
         self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # count of the copy, statistic, its copy
 
     def update(self, tau: float) -> None:
         """
         Update the copies with coefficient ``tau`` in [0, 1]; 1 copies.
 
-        Batch norm's statistics are always copied (https://github.com/DLR-RM/stable-baselines3/issues/996). Statistics of
-        features (``Centering``, ``Whitening``) belong to the weights that made the features, so they are averaged like the
-        weights; the first ones are copied, in place of the initial zeros.
+        Buffers, such as batch norm's statistics, are always copied (https://github.com/DLR-RM/stable-baselines3/issues/996).
+        Statistics of features (``Centering``, ``Whitening``) belong to the weights that made the features, so they are
+        averaged, too; the first ones are copied, in place of the initial zeros.
         """
-        (online, target), (statistics, copies) = self._found(), self._statistics
+        (online, target), (buffers, copies) = self._found(), self._buffers
         with th.no_grad():
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
@@ -37,7 +37,7 @@ class TargetCopy:
             for count, statistic, copy in self._of_features:
                 copy.lerp_(statistic, th.where(count == 0, 1.0, tau))
             if copies:
-                th._foreach_copy_(copies, statistics)
+                th._foreach_copy_(copies, buffers)
 
     def forget_tensors(self) -> None:
         """Call this when moving to another device, because buffers are then replaced by new tensors."""
@@ -48,17 +48,18 @@ class TargetCopy:
             online, target = (
                 [part for network in side for part in network.modules()] for side in zip(*self.pairs, strict=True)
             )
-            self._parameters = _own_parameters(online), _own_parameters(target)
-            self._statistics, self._of_features = ([], []), []
+            tied = {id(copy): (own, copy) for own, copy in zip(_own_parameters(online), _own_parameters(target), strict=True)}
+            self._parameters = [own for own, _ in tied.values()], [copy for _, copy in tied.values()]
+            self._buffers, self._of_features = ([], []), []
             for module, its_copy in zip(online, target, strict=True):
                 # The buffers themselves, because the tensors of a state dict stop sharing their memory once pickled.
                 found, copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
-                for name in (name for name in found if "running_" in name):
-                    if "running_count" in found and name != "running_count":
-                        self._of_features.append((copies["running_count"], found[name], copies[name]))
+                for name, buffer in found.items():
+                    if "running_count" in found and "running_" in name and name != "running_count":
+                        self._of_features.append((copies["running_count"], buffer, copies[name]))
                     else:
-                        self._statistics[0].append(found[name])
-                        self._statistics[1].append(copies[name])
+                        self._buffers[0].append(buffer)
+                        self._buffers[1].append(copies[name])
         return self._parameters
 
 
