@@ -47,8 +47,8 @@ class UpdateMonitor:
 
     def check_model(self, n_updates: int) -> None:
         """Raise FloatingPointError if the parameters are not finite after ``n_updates``: the last losses cannot show it."""
-        tensors = [tensor for tensor in self._model.parameters() if tensor.is_floating_point() and tensor.numel()]
-        found = th.stack(th._foreach_norm(tensors, float("inf"))).max().item()  # the largest absolute value
+        parameters = [tensor.detach() for tensor in self._model.parameters() if tensor.is_floating_point() and tensor.numel()]
+        found = th.stack(th._foreach_norm(parameters, float("inf"))).max().item()  # the largest absolute value
         if not np.isfinite(found):
             self._refuse(n_updates, "parameters", str(found))
 

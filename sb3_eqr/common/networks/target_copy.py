@@ -23,7 +23,7 @@ class TargetCopy:
         """
         Update the copies with coefficient ``tau`` in [0, 1]; 1 copies.
 
-        Buffers, such as batch norm's statistics, are always copied (https://github.com/DLR-RM/stable-baselines3/issues/996).
+        Persistent buffers, as batch norm's statistics, are always copied (https://github.com/DLR-RM/stable-baselines3/issues/996).
         Statistics of features (``Centering``, ``Whitening``) belong to the weights that made the features, so they are
         averaged, too; the first ones are copied, in place of the initial zeros.
         """
@@ -54,11 +54,11 @@ class TargetCopy:
             for module, its_copy in zip(online, target, strict=True):
                 # The buffers themselves, because the tensors of a state dict stop sharing their memory once pickled.
                 found, copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
-                for name, buffer in found.items():
+                for name in (name for name in found if name in module.state_dict()):
                     if "running_count" in found and "running_" in name and name != "running_count":
-                        self._of_features.append((copies["running_count"], buffer, copies[name]))
+                        self._of_features.append((copies["running_count"], found[name], copies[name]))
                     else:
-                        self._buffers[0].append(buffer)
+                        self._buffers[0].append(found[name])
                         self._buffers[1].append(copies[name])
         return self._parameters
 
