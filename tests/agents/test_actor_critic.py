@@ -234,11 +234,11 @@ def test_rewards_are_standardised(agent):
     assert model.reward_mean == pytest.approx(rewards.mean(), abs=0.2 * model.reward_scale)
 
     def after(env, n):
-        return make(agent, env, learning_starts=0).learn(n).reward_scale
+        return make(agent, env, learning_starts=0, train_freq=10).learn(n).reward_scale
 
     assert after(MoveEnv(), 90) == 1.0  # too few
     normalize = VecNormalize(make_vec_env(MoveEnv, 1))
-    normalized = make(agent, normalize, learning_starts=0).learn(130)
+    normalized = make(agent, normalize, learning_starts=0, train_freq=10).learn(130)
     expected = normalized.replay_buffer.rewards[:130].std() / float(normalize.ret_rms.var) ** 0.5
     assert normalized.reward_scale == pytest.approx(expected, rel=0.1)
     assert after(VecNormalize(make_vec_env(MoveEnv, 1), norm_reward=False), 130) not in (0.0, 1.0)
