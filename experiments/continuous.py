@@ -32,6 +32,7 @@ from torch import nn
 from experiments import markdown
 from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
+from sb3_eqr.benchmark.statistics import estimate, iqm
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 
@@ -197,7 +198,8 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
 def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, cost: float) -> str:
     """
     Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
-    over tasks, bootstrap interval over seeds. The areas of all but the baseline end after 1 / ``cost`` of the steps.
+    over tasks, bootstrap interval over seeds; and the IQM of all areas, each divided by the baseline's mean. The areas of all
+    but the baseline end after 1 / ``cost`` of the steps.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
@@ -207,7 +209,7 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
     for arm in ARMS:
-        cells, ratios = [], []
+        cells, ratios, normalised = [], [], []
         for task in tasks:
             values, of_baseline = areas.get((task, arm)), areas[task, baseline]
             if values is None:
@@ -218,18 +220,22 @@ def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str
             pair = values, of_baseline
             if min(values.mean(), of_baseline.mean()) <= 0:
                 continue  # a ratio would say nothing
+            normalised.append(values / of_baseline.mean())
             draws = [sample[rng.integers(len(sample), size=(10_000, len(sample)))].mean(axis=1) for sample in pair]
             ratios.append(np.append(draws[0] / draws[1], values.mean() / of_baseline.mean()))
-        shown = ""
+        shown, middle = "", ""
         if ratios:
             mean = np.exp(np.mean(np.log(np.maximum(ratios, 1e-3)), axis=0))
             low, high = np.percentile(mean[:-1], [2.5, 97.5])
             has_interval = min(len(areas[task, arm]) for task in tasks if (task, arm) in areas) > 1
             interval = f" [{low:.2f}, {high:.2f}]" if has_interval else ""
             shown = f"{mean[-1]:.2f}{interval}, {len(ratios)} tasks"
+            n_seeds = min(map(len, normalised))
+            value, *ends = estimate(iqm, np.stack([of_task[:n_seeds] for of_task in normalised], axis=1), 2_000)
+            middle = f"{value:.2f}" + (f" [{ends[0]:.2f}, {ends[1]:.2f}]" if n_seeds > 1 else "")
         if any(cells):
-            table.append([arm, *cells, shown])
-    return markdown(["arm", *tasks, f"ratio to {baseline}, geometric mean"], table)
+            table.append([arm, *cells, shown, middle])
+    return markdown(["arm", *tasks, f"ratio to {baseline}, geometric mean", "IQM"], table)
 
 
 def rows(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], arms: Sequence[str]) -> list[dict[str, Any]]:
