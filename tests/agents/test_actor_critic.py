@@ -466,7 +466,7 @@ class Centred(BaseFeaturesExtractor):
 
     def forward(self, observations):
         if self.training:
-            self.mean.lerp_(observations.mean(dim=0).detach(), 0.1)
+            self.mean = 0.9 * self.mean + 0.1 * observations.mean(dim=0).detach()
         return self.second(self.first(observations - self.mean))
 
 

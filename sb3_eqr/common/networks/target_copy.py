@@ -16,7 +16,7 @@ class TargetCopy:
     def __init__(self, pairs: Sequence[tuple[nn.Module, nn.Module]]):
         self.pairs = list(pairs)
         self._parameters: tuple[list[th.Tensor], list[th.Tensor]] | None = None  # of the networks, and of their copies
-        self._buffers: tuple[list[th.Tensor], list[th.Tensor]] = [], []  # those that are copied
+        self._buffers: list[tuple[nn.Module, str, th.Tensor]] = []  # those that are copied: module, name, copy
         self._of_features: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []  # count of the copy, statistic, its copy
 
     def update(self, tau: float) -> None:
@@ -27,7 +27,7 @@ class TargetCopy:
         Statistics of features (``Centering``, ``Whitening``) belong to the weights that made the features, so they are
         averaged, too; the first ones are copied, in place of the initial zeros.
         """
-        (online, target), (buffers, copies) = self._found(), self._buffers
+        online, target = self._found()
         with th.no_grad():
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
@@ -36,8 +36,9 @@ class TargetCopy:
                 th._foreach_copy_(target, online)
             for count, statistic, copy in self._of_features:
                 copy.lerp_(statistic, th.where(count == 0, 1.0, tau))
-            if copies:
-                th._foreach_copy_(copies, buffers)
+            if self._buffers:  # a module may have replaced its tensor
+                copies = [copy for _, _, copy in self._buffers]
+                th._foreach_copy_(copies, [module.get_buffer(name) for module, name, _ in self._buffers])
 
     def forget_tensors(self) -> None:
         """Call this when moving to another device, because buffers are then replaced by new tensors."""
@@ -50,7 +51,7 @@ class TargetCopy:
             )
             tied = {id(copy): (own, copy) for own, copy in zip(_own_parameters(online), _own_parameters(target), strict=True)}
             self._parameters = [own for own, _ in tied.values()], [copy for _, copy in tied.values()]
-            self._buffers, self._of_features = ([], []), []
+            self._buffers, self._of_features = [], []
             for module, its_copy in zip(online, target, strict=True):
                 # The buffers themselves, because the tensors of a state dict stop sharing their memory once pickled.
                 found, copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
@@ -58,8 +59,7 @@ class TargetCopy:
                     if "running_count" in found and "running_" in name and name != "running_count":
                         self._of_features.append((copies["running_count"], found[name], copies[name]))
                     else:
-                        self._buffers[0].append(found[name])
-                        self._buffers[1].append(copies[name])
+                        self._buffers.append((module, name, copies[name]))
         return self._parameters
 
 
