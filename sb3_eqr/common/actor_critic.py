@@ -142,7 +142,6 @@ class EqRActorCritic(EqROffPolicy):
             if not buffer.can_sample():
                 return
             self._find_reward_scale(buffer, gradient_steps)
-            policy.set_training_mode(True)
             update_learning_rate(policy.latent_optimizer, self.lr_schedule(self._current_progress_remaining))
             self.replay_buffer = BeforeSamples(buffer, self._update_latent_model, self.latent_batch_size or batch_size)  # type: ignore[assignment]
         if policy.has_latent:
