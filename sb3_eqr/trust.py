@@ -77,6 +77,11 @@ def read_plain(path: pathlib.Path) -> dict[str, Any]:
     return found
 
 
+def read_trusted(path: pathlib.Path) -> dict[str, Any]:
+    """As :func:`read_plain`, with all Python objects that the file names, which runs their code."""
+    return dict(yaml.unsafe_load(path.read_text(encoding="utf-8")))
+
+
 def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None:
     """
     :param folder: folder with RL Zoo's args.yml and config.yml

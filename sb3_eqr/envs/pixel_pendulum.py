@@ -40,7 +40,7 @@ class PixelPendulum(PixelEnv):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20, "periodic": ["angle"]}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20, "periods": {"angle": 2 * pi}}
 
     def __init__(self, gravity: bool = True, size: int = 48, n_torques: int = 3, render_mode: str | None = None):
         check("n_torques", n_torques, integer(3))

@@ -30,7 +30,7 @@ class PlanarBody(gym.Env):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": [], "periodic": ["angle"]}
+    metadata = {"render_modes": [], "periods": {"angle": 2 * pi}}
 
     def __init__(self, n_noise: int = 0):
         check("n_noise", n_noise, integer(0))
@@ -44,6 +44,8 @@ class PlanarBody(gym.Env):
         """As in gymnasium."""
         super().reset(seed=seed)
         drawn = {"position": self.np_random.uniform(-START, START, 2), "angle": self.np_random.uniform(-pi, pi)}
+        if unknown := set(options or {}) - set(drawn):
+            raise ValueError(f"options must only contain position, angle, got {', '.join(map(repr, sorted(unknown)))}.")
         state = {**drawn, **(options or {})}
         check("angle", state["angle"], number())
         check("position", list(state["position"]), POSITION)

@@ -35,7 +35,7 @@ class SlidingBall(PixelEnv):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periodic": ["position"]}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periods": {"position": 1.0}}
 
     def __init__(
         self,

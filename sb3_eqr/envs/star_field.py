@@ -42,7 +42,7 @@ class StarField(PixelEnv):
     :raises ValueError: if an argument is out of range
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periodic": ["translation"]}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "periods": {"translation": 1.0}}
 
     def __init__(
         self,

@@ -3,7 +3,7 @@
 import argparse
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import gymnasium as gym
 from matplotlib.figure import Figure
@@ -13,7 +13,7 @@ from sb3_eqr.common.checks.arguments import SuggestingParser
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.envs import import_packages
 from sb3_eqr.visualize.diagnostics import diagnose
-from sb3_eqr.visualize.latents import DEPTH, Play, encode, names_of_factors, play
+from sb3_eqr.visualize.latents import DEPTH, Play, encode, known_depth, names_of_factors, play
 from sb3_eqr.visualize.loading import action_names, factor_names, load_model, make_env, parse_kwargs
 from sb3_eqr.visualize.pictures import all_pictures, latent_figure, write_pictures
 from sb3_eqr.visualize.tables import all_tables, write_tables
@@ -58,29 +58,30 @@ def run(args: argparse.Namespace) -> None:
     folder = args.out or args.model.with_name(f"{args.model.stem}_diagnostics")
     diagnostics = diagnose(model, played, args.seed)
     actions, factors = action_names(env, model), factor_names(env)
-    periodic = (env.get_attr("metadata", 0)[0] or {}).get("periodic", ())
+    periods = (env.get_attr("metadata", 0)[0] or {}).get("periods", {})
     tables = all_tables(diagnostics, actions, factors)
     write_tables(tables, folder)
     figures = all_pictures(diagnostics, actions, factors)
-    write_pictures(figures | latent_figures(model, played, factors, periodic), folder)
+    write_pictures(figures | latent_figures(model, played, factors, periods), folder)
     if args.video:
         from sb3_eqr.visualize import record  # only videos need its libraries
 
-        record(model, env, folder / "play", depth=args.depth, seed=args.seed, deterministic=args.deterministic)
+        n_steps = max(200, 2 * known_depth(model, args.depth))
+        record(model, env, folder / "play", n_steps, args.depth, seed=args.seed, deterministic=args.deterministic)
     print(diagnostics.summary)
     table = tables["transition"][["steps_ahead", "projection_error", "projection_shuffled", "projection_still"]]
     print(table.to_string(index=False, float_format="{:.2g}".format))
     print(f"Written: {folder}")
 
 
-def latent_figures(model: EqROffPolicy, played: Play, factors: list[str], periodic: Sequence[str] = ()) -> dict[str, Figure]:
-    """One figure coloured by time, or one per true factor; ``periodic`` has the keys of ``info`` whose factors are."""
+def latent_figures(model: EqROffPolicy, played: Play, factors: list[str], periods: Mapping[str, float]) -> dict[str, Figure]:
+    """One figure coloured by time, or one per true factor; ``periods`` are those of the keys of ``info``."""
     states = encode(model, played.samples.observations)
     if played.factors is None:
         return {"latents": latent_figure(model, states)}
     names = names_of_factors(played.factors.shape[1], factors)
     return {
-        f"latents_{name.replace(' ', '_')}": latent_figure(model, states, values, name, name.split(" ")[0] in periodic)
+        f"latents_{name.replace(' ', '_')}": latent_figure(model, states, values, name, periods.get(name.split(" ")[0]))
         for name, values in zip(names, played.factors.T, strict=True)
     }
 

@@ -128,7 +128,8 @@ def play(
             obs = new_obs
     starts, envs = np.indices((buffer.n_starts, env.num_envs)).reshape(2, -1)
     samples = buffer.windows(starts, envs)  # already normalised by a VecNormalize
-    known = all(found is not None for found in factors)
+    shapes = {None if found is None else found.shape for found in factors}
+    known = len(shapes) == 1 and None not in shapes
     return Play(samples, np.stack(factors)[starts, envs] if known else None)  # type: ignore[arg-type]
 
 
@@ -146,9 +147,11 @@ def _space(obs: Any, space: spaces.Space) -> spaces.Space:
 
 
 def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:
-    """The true states, (n_envs, F); ``None`` if an environment does not report it."""
+    """The true states, (n_envs, F); ``None`` if an environment does not report it in numbers."""
     found = [[np.ravel(info[key]) for key in FACTOR_KEYS if key in info] for info in infos]
-    return np.array([np.concatenate(row) for row in found]) if all(found) else None
+    rows = [np.concatenate(row) for row in found if row]
+    are_numbers = all(row.dtype.kind in "biuf" and row.shape == rows[0].shape for row in rows)
+    return np.array(rows, dtype=np.float64) if len(rows) == len(found) and are_numbers else None
 
 
 def names_of_factors(n_factors: int, names: Sequence[str]) -> list[str]:

@@ -127,8 +127,18 @@ def _zoo_env(
     norm_reward = (hyperparams.get("normalize_kwargs") or {}).get("norm_reward", True)
     made_with = {**(hyperparams.pop("env_kwargs", None) or {}), **(arguments.get("env_kwargs") or {})}
     made_with |= {**({"render_mode": "rgb_array"} if render else {}), **kwargs}
-    options: dict[str, Any] = {"should_render": False, "env_kwargs": made_with, "vec_env_cls": DummyVecEnv}
-    env = create_test_env(arguments["env"], n_envs, stats_path, seed, hyperparams=hyperparams, **options)
+    options: dict[str, Any] = {"should_render": False, "vec_env_cls": DummyVecEnv}
+
+    def make(**env_kwargs: Any) -> VecEnv:
+        given = {**options, "env_kwargs": env_kwargs, "hyperparams": dict(hyperparams)}  # which it changes
+        return create_test_env(arguments["env"], n_envs, stats_path, seed, **given)
+
+    try:
+        env = make(**made_with)
+    except TypeError as error:
+        if "render_mode" not in str(error) or "render_mode" in kwargs:
+            raise
+        env = make(**{key: value for key, value in made_with.items() if key != "render_mode"})
     if (normalize := unwrap_vec_normalize(env)) is not None:
         normalize.norm_reward = norm_reward  # the reward predictor was trained on these rewards
     return env
@@ -166,8 +176,8 @@ def action_names(env: VecEnv, model: EqROffPolicy) -> list[str]:
     if typical.ndim == 2:
         return [f"{sign}{axis}" for axis in range(typical.shape[1]) for sign in "+-"]
     n_actions = len(typical)
-    world = env.get_attr("unwrapped", 0)[0]
-    names = world.get_action_meanings() if hasattr(world, "get_action_meanings") else []
+    is_named = env.has_attr("get_action_meanings")
+    names = env.env_method("get_action_meanings", indices=0)[0] if is_named else []
     return list(names) if len(names) == n_actions else [str(a) for a in range(n_actions)]
 
 

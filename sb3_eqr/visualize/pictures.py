@@ -153,8 +153,9 @@ def _generator(ax: Axes, part: Generators, k: int, drawn: dict[str, Any]) -> Non
     for i, c in enumerate(sorted(largest)):
         shift = (i - (len(largest) - 1) / 2) * 0.6 / max(len(largest), 2)  # so that bars do not hide each other
         name = part.names[c] if len(largest) == len(part.names) else f"coordinate {i + 1} of the {MAX_COORDINATES} largest"
-        x, looks = np.arange(len(part.mean)) + shift, {"color": COLORS[i], "markersize": 3, "elinewidth": 1}
-        bars = ax.errorbar(x, part.mean[:, k, c], part.std[:, k, c], fmt=MARKERS[i], **looks)  # type: ignore[arg-type]
+        style = (list(drawn).index(name) if name in drawn else len(drawn)) % len(MARKERS)  # the same in all panels
+        x, looks = np.arange(len(part.mean)) + shift, {"color": COLORS[style], "markersize": 3, "elinewidth": 1}
+        bars = ax.errorbar(x, part.mean[:, k, c], part.std[:, k, c], fmt=MARKERS[style], **looks)  # type: ignore[arg-type]
         drawn.setdefault(name, bars)
 
 
@@ -219,7 +220,7 @@ def rewards_figure(diagnostics: Diagnostics) -> Figure:
 
 
 def latent_figure(
-    model: EqROffPolicy, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", is_periodic: bool = False
+    model: EqROffPolicy, states: th.Tensor, values: np.ndarray | None = None, label: str = "time", period: float | None = None
 ) -> Figure:
     """
     A panel per block, for at most the 12 that vary most. SO(2) is a point on the circle (the image of the vector (1, 0), as in
@@ -230,7 +231,7 @@ def latent_figure(
     :param states: see :func:`~sb3_eqr.visualize.latents.encode`, (N, D)
     :param values: values for the colours, (N,); default: the order of the states
     :param label: label of the colours
-    :param is_periodic: whether the smallest and the largest of the values are the same, so that they get the same colour
+    :param period: of the values, if they are periodic: values that differ by it get the same colour
     """
     kept = np.unique(np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int))
     colours = (np.arange(len(states)) if values is None else np.asarray(values))[kept]
@@ -244,7 +245,7 @@ def latent_figure(
         for ax, i in zip(axes, shown, strict=True):
             name, group, found = blocks[i]
             constant = spreads[i] <= ROUNDING * float(found.norm()) / len(found) ** 0.5
-            drawn = _draw(ax, group, found, colours, "twilight" if is_periodic else "viridis")
+            drawn = _draw(ax, group, found, colours, period)
             about = " (constant)" if constant else _outside(ax, drawn.get_offsets())
             ax.set_title(f"{name}{about}", loc="left", fontsize=8, pad=3)
             ax.tick_params(labelsize=6, length=2, pad=1)
@@ -276,9 +277,11 @@ def make_axes(figure: Figure, count: int, sharey: bool = False) -> list[Axes]:
     return axes[:count]
 
 
-def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, cmap: str) -> PathCollection:
+def _draw(ax: Axes, group: Group, elements: th.Tensor, colours: np.ndarray, period: float | None) -> PathCollection:
     """Draw the elements of one block, (n, *element_shape), in colours, (n,); returns the points, for the colour bar."""
-    low, high = float(colours.min()), float(colours.max())
+    low, high, cmap = float(colours.min()), float(colours.max()), "viridis" if period is None else "twilight"
+    if period is not None:
+        low, high = (low + high - period) / 2, (low + high + period) / 2
     matrix, vector = frame(group, elements)
     if isinstance(group, SO) and group.n == 2:
         turn = np.linspace(0, 2 * np.pi, 100)

@@ -74,6 +74,8 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, default={})
+    parser.add_argument("-name", "--repo-name")  # of the hub; otherwise argparse reads -n ame
     parser.add_argument("--device", default="auto")
     parser.add_argument("-i", "--trained-agent", default="")
     parser.add_argument("--track", action="store_true")
@@ -108,14 +110,16 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     if path is None:
         check_entry(args.hyperparams, algo, "--hyperparams")
         return None
-    if args.resume is not None and args.conf_file is None:
+    if args.resume is not None:
         with failing("--resume: "):
             of_run = config_of(args.resume, args.trust, args.gym_packages)
         path = path if of_run is None else write_entry(args, of_run)
-    entry = read_entry(path, args.env, args.hyperparams)
+    # as in RL Zoo, --env-kwargs replace those of the entry
+    changes = {**args.hyperparams, **({"env_kwargs": args.env_kwargs} if args.env_kwargs else {})}
+    entry = read_entry(path, args.env, changes)
     check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
-    name = entry_name(read_file(path), args.env, args.hyperparams)
+    name = entry_name(read_file(path), args.env, changes)
     if not name.startswith("default-"):  # RL Zoo would use "default"
         return path
     print(f"Using the section {name!r} of {path}")
@@ -123,9 +127,9 @@ def prepare_training(args: argparse.Namespace) -> str | None:
 
 
 def write_entry(args: argparse.Namespace, entry: dict[str, Any]) -> str:
-    """:return: a new file with an entry for the environment"""
-    file = temporary_folder() / f"{args.algo}.yml"
-    file.write_text(yaml.safe_dump({args.env: entry}), encoding="utf-8")
+    """:return: a new file with an entry for the environment, in Python, because it may hold objects"""
+    file = temporary_folder() / f"{args.algo}.py"
+    file.write_text(f"import yaml\nhyperparams = yaml.unsafe_load({yaml.dump({args.env: entry})!r})\n", encoding="utf-8")
     return str(file)
 
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import yaml
+from optuna import TrialPruned
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from rl_zoo3.utils import ALGOS
@@ -22,9 +23,9 @@ from sb3_eqr import AGENTS
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback
 from sb3_eqr.common.saving.random_state import preserved_rng_state
-from sb3_eqr.trust import check_zoo_folder, read_plain
+from sb3_eqr.trust import check_zoo_folder, read_plain, read_trusted
 from sb3_eqr.zoo.checks import fail
-from sb3_eqr.zoo.entries import read_entry
+from sb3_eqr.zoo.entries import find_entry
 
 FOLDER = "checkpoints"  # in the folder of a run
 
@@ -86,8 +87,12 @@ class ResumableExperiment(ExperimentManager):
         shutil.rmtree(self.save_path, ignore_errors=True)
 
     def objective(self, trial: Any) -> float:
-        """As RL Zoo's; keeps the best trial."""
-        value = super().objective(trial)
+        """As RL Zoo's; keeps the best trial, and prunes those that diverge."""
+        try:
+            value = super().objective(trial)
+        except FloatingPointError as error:  # RL Zoo expects ValueError
+            print(f"Trial {trial.number}: {error}")
+            raise TrialPruned from error
         self.best = max(self.best, (value, trial.params), key=lambda found: found[0])
         return value
 
@@ -103,8 +108,9 @@ class ResumableExperiment(ExperimentManager):
                 best = self.load_trial(self.storage, self.study_name, convert=False)  # also of earlier commands
         if self.algo in AGENTS and best:
             env_id = self.env_name.gym_id
-            found = {**read_entry(str(self.config), env_id, {}), **HYPERPARAMS_CONVERTER[self.algo](best)}
-            print(f"As a file for --conf-file:\n{yaml.safe_dump({env_id: found})}")
+            entry = find_entry(str(self.config), env_id, self.custom_hyperparams or {})
+            found = {**entry, **HYPERPARAMS_CONVERTER[self.algo](best)}
+            print(f"As a file for --conf-file:\n{yaml.dump({env_id: found})}")
 
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""
@@ -163,7 +169,8 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
                 check_zoo_folder(config.parent, packages)
             if not (config.parent / "args.yml").is_file():
                 raise ValueError(f"{config.parent} must have args.yml beside config.yml, as RL Zoo writes it, got none.")
-            entry, arguments = read_plain(config), read_plain(config.parent / "args.yml")
+            read = read_trusted if trust else read_plain
+            entry, arguments = read(config), read(config.parent / "args.yml")
             given = {name: arguments.get(name) for name in ("env_kwargs", "n_timesteps")}
             return {**entry, **{name: value for name, value in given.items() if value not in (None, {}, -1)}}
     return None

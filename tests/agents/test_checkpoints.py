@@ -132,6 +132,22 @@ def test_checkpoints_are_counted_from_the_first_step_of_the_run(tmp_path):
     assert [path.name for path in find_checkpoints(tmp_path)] == ["checkpoint-000000000120"]
 
 
+def test_training_in_parts_writes_the_checkpoints_that_end_a_part(tmp_path):
+    model, callback = EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL), ExactCheckpointCallback(40, tmp_path, keep=9)
+    for _ in range(3):
+        model.learn(40, callback, reset_num_timesteps=False)
+    assert [path.name[-3:] for path in find_checkpoints(tmp_path)] == ["040", "080"]
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "replay_buffer.pkl"])
+def test_a_damaged_checkpoint_is_written_again_by_a_run_resumed_before_it(tmp_path, name):
+    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(60, ExactCheckpointCallback(20, tmp_path, keep=9))
+    first, second = find_checkpoints(tmp_path)
+    (second / name).write_bytes((second / name).read_bytes()[:100])
+    EqRQRDQN.resume(first, ChainEnv()).learn(40, ExactCheckpointCallback(20, tmp_path, keep=9), reset_num_timesteps=False)
+    assert EqRQRDQN.resume(second, ChainEnv()).num_timesteps == 40
+
+
 def test_different_runs_cannot_share_a_folder(checkpoint):
     folder = checkpoint.parent
     before = sorted(folder.iterdir())

@@ -13,6 +13,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
@@ -451,3 +452,18 @@ def test_moments_of_other_optimizers_are_loaded(optimizer, tmp_path):
     model.save(tmp_path / "model")
     loaded = MAKERS[1].algorithm.load(tmp_path / "model", ChainEnv())
     assert len(loaded.policy.optimizer.state) == len(model.policy.optimizer.state)
+
+
+class OwnBox(spaces.Box):
+    """A space that is saved as a pickle."""
+
+
+def test_a_buffer_of_a_space_of_ones_own_needs_trust(make, tmp_path):
+    env = ChainEnv()
+    env.observation_space = OwnBox(-1, 1, (3,), np.float32)
+    model = make(env).learn(40)
+    model.save_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match=r"a pickle of .*OwnBox"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    model.load_replay_buffer(tmp_path / "buffer", trust=True)
+    assert isinstance(model.replay_buffer.observation_space, OwnBox)

@@ -452,6 +452,11 @@ def test_a_planar_body_starts_at_two_finite_numbers(position):
         PlanarBody().reset(options={"position": position})
 
 
+def test_unknown_options_of_the_planar_body_are_named():
+    with pytest.raises(ValueError, match="must only contain position, angle, got 'pos'"):
+        PlanarBody().reset(options={"pos": (0.0, 0.0)})
+
+
 def test_the_noise_of_the_planar_body_does_not_move_it():
     quiet, noisy = gym.make("PlanarBody-v0"), gym.make("PlanarBodyNoise-v0")
     for env in (quiet, noisy):

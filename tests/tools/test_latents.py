@@ -102,3 +102,18 @@ def test_other_agents_raise(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             look()
+
+
+@pytest.mark.parametrize("position", ["north", None, [1.0], [[1.0, 2.0]]])
+def test_only_numbers_of_a_constant_shape_are_true_factors(position):
+    class Reporting(ChainEnv):
+        def reset(self, **kwargs):
+            return super().reset(**kwargs)[0], {"position": position}
+
+        def step(self, action):
+            return *super().step(action)[:4], {"position": position if position in ("north", None) else [1.0]}
+
+    env = make_vec_env(Reporting, 1)
+    model = EqRQRDQN("MlpPolicy", env, buffer_size=200, device="cpu", seed=0)
+    found = play(model, env, n_steps=40, depth=2).factors
+    assert (found is None) == (position != [1.0])

@@ -13,6 +13,7 @@ import pytest
 import torch as th
 import yaml
 from gymnasium import spaces
+from matplotlib.colors import to_rgba
 from PIL import Image
 from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,7 +26,7 @@ from sb3_eqr.trust import check_zoo_folder
 from sb3_eqr.visualize import loading
 from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import encode, play
-from sb3_eqr.visualize.pictures import all_pictures, latent_figure
+from sb3_eqr.visualize.pictures import all_pictures, generators_figure, latent_figure
 from sb3_eqr.visualize.tables import all_tables
 from tests.models import PAPER_FLAT
 
@@ -243,11 +244,11 @@ def test_plots_share_a_scale_and_have_margins():
     assert all(tick == round(tick) for tick in ax.get_xticks())
 
 
-@pytest.mark.parametrize("is_periodic, colours", [(True, "twilight"), (False, "viridis")])
-def test_periodic_factors_have_cyclic_colours(is_periodic, colours):
+@pytest.mark.parametrize("period, colours", [(10.0, "twilight"), (None, "viridis")])
+def test_periodic_factors_have_cyclic_colours(period, colours):
     model = make_model(group="SE(2)")
     states = th.randn(9, 12, generator=th.Generator().manual_seed(0))
-    figure = latent_figure(model, states, np.arange(9.0), "angle", is_periodic)
+    figure = latent_figure(model, states, np.arange(9.0), "angle", period)
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
 
 
@@ -403,3 +404,14 @@ def test_kwargs_are_python_or_text():
 def test_unknown_names():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         visualize.nothing  # noqa: B018
+
+
+def test_a_coordinate_has_one_colour_in_all_panels_of_a_product():
+    model = make_model(group="SE(2) x T(2)", n_blocks=1, symmetry_coef=0.0)
+    figure = generators_figure(look(model, 60), ["BACK", "ON"])
+    (legend,) = figure.legends
+    drawn = zip(legend.texts, legend.legend_handles, strict=True)
+    colours = {text.get_text(): tuple(handle.get_color()[0]) for text, handle in drawn}
+    names = [["angle 0-1", "t 0", "t 1"], ["t 0", "t 1"]]
+    for ax, expected in zip(figure.axes, names, strict=True):
+        assert [to_rgba(bars.lines[0].get_color()) for bars in ax.containers] == [colours[name] for name in expected]

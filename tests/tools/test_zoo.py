@@ -23,8 +23,8 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_eqr import DISCRETE, EqRQRDQN, EqRRainbow, cli, zoo
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
-from sb3_eqr.trust import read_plain
-from sb3_eqr.zoo.__main__ import COMMANDS, find_hyperparameters
+from sb3_eqr.trust import read_plain, read_trusted
+from sb3_eqr.zoo.__main__ import COMMANDS, find_hyperparameters, parse
 from sb3_eqr.zoo.entries import entry_name
 from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
 from tests.toys import ChainEnv, DictEnv, ImageEnv
@@ -52,6 +52,7 @@ from tests.toys import ChainEnv, DictEnv, ImageEnv
         ("train --algo eqr_qrdqn --env MinAtar/Breakot-v1", "Did you mean 'MinAtar/Breakout-v1'?"),
         ("enjoy --algo eqr_qrdqn -f nowhere", "nowhere/eqr_qrdqn/?.* was not found.* train one first"),
         ("enjoy --algo eqr_qrdqn", "was not found.* train one first"),
+        ("train --algo eqr_qrdqn --env SlidingBall-v0 --env-kwargs size:20", "SlidingBall-v0: size must be an integer >= 36"),
         ("train --algo eqr_qrdqn -i nothing.zip", "must be the path of a .zip file.*'nothing.zip'"),
         ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
         ("train --algo eqr_qrdqn -params learning_rate:'1e-3'", "learning_rate must be a number, .*'1e-3', .* write 0.001"),
@@ -201,17 +202,19 @@ def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, tmp_path):
 
 
 def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
-    line = f"train --algo eqr_qrdqn --env CartPole-v1 --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
-    sb3_eqr(f"{line} -n 300 --checkpoint-every 100 -params n_envs:2 gradient_steps:1 gamma:0.9 learning_starts:20")
+    line = f"train --algo eqr_qrdqn --env CartPole-v1 --conf-file eqr_qrdqn --eval-freq 100 --eval-episodes 1 -f {tmp_path}"
+    changes = "n_envs:2 gradient_steps:1 gamma:0.9 learning_starts:20 policy_kwargs:dict(activation_fn=th.nn.ELU)"
+    sb3_eqr(f"{line} -n 300 --checkpoint-every 100 -params {changes}")
     run = tmp_path / "eqr_qrdqn" / "CartPole-v1_1"
     assert (run / "CartPole-v1.zip").exists() and (run / "best_model.zip").exists()
-    sb3_eqr(f"{line} -n 400 --resume {run}")
+    assert "pass --trust" in sb3_eqr(f"{line} -n 400 --resume {run}", code=2).err
+    sb3_eqr(f"{line} -n 400 --resume {run} --trust")
     resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_2"
-    model = EqRQRDQN.load(resumed / "CartPole-v1.zip")
+    model = EqRQRDQN.load(resumed / "CartPole-v1.zip", trust=True)
     assert (model.n_envs, model.gradient_steps, model.gamma) == (2, 1, 0.9) and model.num_timesteps >= 400
-    settings = read_plain(resumed / "CartPole-v1" / "config.yml")
+    settings = read_trusted(resumed / "CartPole-v1" / "config.yml")
     assert (settings["n_envs"], settings["gradient_steps"], settings["gamma"]) == (2, 1, 0.9)
-    assert read_plain(resumed / "CartPole-v1" / "args.yml")["conf_file"] is None  # it was resumed by a temporary file
+    assert read_plain(resumed / "CartPole-v1" / "args.yml")["conf_file"] == "eqr_qrdqn"  # not the temporary file
 
 
 def test_a_killed_run_is_named_by_enjoy_and_resumed_to_its_own_end(sb3_eqr, tmp_path):
@@ -302,6 +305,20 @@ def test_a_signal_to_end_saves_the_agent_and_one_before_training_leaves_no_folde
     monkeypatch.setattr(EqRQRDQN, "_setup_model", lambda *_: signal.raise_signal(signal.SIGTERM))
     sb3_eqr(line, code=130)
     assert not (tmp_path / "eqr_qrdqn" / "CartPole-v1_2").exists()
+
+
+def test_a_trial_that_diverges_is_pruned_and_does_not_end_the_search(monkeypatch):
+    def diverge(self, trial):
+        raise FloatingPointError("losses must be finite")
+
+    monkeypatch.setattr(ResumableExperiment.__base__, "objective", diverge)
+    study = optuna.create_study()
+    study.optimize(object.__new__(ResumableExperiment).objective, n_trials=2)
+    assert [trial.state.name for trial in study.trials] == ["PRUNED"] * 2
+
+
+def test_the_name_of_a_repository_is_not_a_number_of_steps():
+    assert parse(["--algo", "eqr_qrdqn", "-orga", "us", "-name", "mine"]).n_timesteps == -1
 
 
 def test_configurations_by_name_and_stock_algorithms():
@@ -440,7 +457,8 @@ def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     shown = sb3_eqr(f"{line} --max-total-trials 1 --study-name a --storage sqlite:///{tmp_path}/a.db")
     assert "Number of finished trials:  1" in shown.out
     entry = yaml.safe_load(shown.out.partition("As a file for --conf-file:")[2])["MinAtar/Breakout-v1"]
-    assert entry["policy"] == "CnnPolicy" and "n_timesteps" in entry  # also what was not searched
+    assert entry["policy"] == "CnnPolicy" and "n_timesteps" in entry  # also what was not searched,
+    assert entry["learning_starts"] == 25  # and what the command line changed
     layers = {"features_extractor_kwargs": {"layers": [[16, 3, 1]]}}
     assert entry["policy_kwargs"].items() >= layers.items() and {"gamma", "gradient_steps"} <= entry.keys()
     assert [path.suffix for path in (tmp_path / "eqr_rainbow").iterdir() if path.is_dir()] == []  # no run to play

@@ -263,3 +263,25 @@ def test_bad_parameterization_and_generators():
             MatrixLieGroup(generators)
     with pytest.raises(ValueError, match="generators must be linearly independent, got 2 linearly dependent matrices"):
         MatrixLieGroup([[[1.0]], [[2.0]]])
+
+
+def test_the_inverse_of_a_far_translation_is_exact():
+    turn, right, up = np.zeros((3, 3, 3))
+    turn[:2, :2], right[0, 2], up[1, 2] = [[0, -1], [1, 0]], 1, 1
+    group = MatrixLieGroup(np.stack([turn, right, up]))
+    element = group.element(th.tensor([0.3, 3000.0, -2000.0]))
+    whole = th.linalg.inv(group.matrix(element).double())
+    th.testing.assert_close(group.matrix(group.inverse(element)).double(), whole, rtol=1e-6, atol=1e-3)
+
+
+def test_generators_are_copied():
+    """Those of the caller may change later, need a gradient, or be used first in inference mode."""
+    turn = th.tensor([[[0.0, -1.0], [1.0, 0.0]]], dtype=th.float64, requires_grad=True)
+    group, angle = MatrixLieGroup(turn), th.tensor([0.5], requires_grad=True)
+    with th.inference_mode():
+        turn.mul_(5)
+        group.element(angle)
+    found = group.element(angle)
+    found[0, 0].backward()
+    assert found[0, 0].item() == pytest.approx(np.cos(0.5), rel=1e-4)
+    assert angle.grad.item() == pytest.approx(-np.sin(0.5), rel=1e-4)

@@ -220,3 +220,11 @@ def test_evaluation_changes_neither_the_running_mean_nor_the_gradient():
 def test_layers_print_their_sizes():
     assert repr(NoisyLinear(3, 5)) == "NoisyLinear(in_features=3, out_features=5)"
     assert "SE(2), n_blocks=4, state_dim=24" in repr(GroupLayer(7, "SE(2)", n_blocks=4))
+
+
+@pytest.mark.parametrize("kwargs", [{"whiten": True}, {"parameterization": "exp"}, {"parameterization": "gram-schmidt"}])
+def test_the_group_layer_computes_in_float32_among_bfloat16(kwargs):
+    layer, features = GroupLayer(7, "SE(3)", n_blocks=4, **kwargs).eval(), th.randn(64, 7)
+    with th.autocast("cpu", th.bfloat16):
+        found = layer(features.bfloat16())
+    assert th.equal(found, layer(features.bfloat16().float()))

@@ -125,7 +125,10 @@ class MatrixGroup(Group):
         return left @ self.matrix(right)  # [A, t] [[A', t'], [0, 1]] = [A A', A t' + t]
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
-        return guarded_inverse(self.matrix(element))[..., : self.element_shape[0], :]
+        if not self.is_affine:
+            return guarded_inverse(element)
+        inverse = guarded_inverse(element[..., :-1])  # of [A, t]: [A⁻¹, −A⁻¹ t], however large t is
+        return th.cat([inverse, -inverse @ element[..., -1:]], dim=-1)
 
     def identity(self, *batch: int, dtype: th.dtype | None = None, device: th.device | str | None = None) -> th.Tensor:
         return th.eye(*self.element_shape, dtype=dtype, device=device).expand(*batch, *self.element_shape)
@@ -302,8 +305,8 @@ class MatrixLieGroup(MatrixGroup):
                 f"generators must be linearly independent, got {len(basis)} linearly dependent matrices. Leave out "
                 "those that are linear combinations of others."
             )
-        self.generators = basis
-        checksum = zlib.crc32(basis.numpy().tobytes())  # distinguishes groups whose bases have the same shape
+        self.generators = basis.detach().clone()
+        checksum = zlib.crc32(self.generators.numpy().tobytes())  # distinguishes groups whose bases have the same shape
         d, m, _ = basis.shape
         is_affine = m > 1 and not bool(basis[:, -1].any())  # if the last row of A is 0, that of exp(A) is 0 ... 0 1
         super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, m, is_affine)
@@ -321,5 +324,6 @@ def _placed(group: MatrixLieGroup, dtype: th.dtype, device: th.device) -> th.Ten
     """The generators, copied once per device instead of once per step, and not saved with the group."""
     copies = _PLACED.setdefault(group, {})
     if (dtype, device) not in copies:
-        copies[dtype, device] = group.generators.to(dtype=dtype, device=device)
+        with th.inference_mode(False):  # as in _bottom_row
+            copies[dtype, device] = group.generators.to(dtype=dtype, device=device)
     return copies[dtype, device]

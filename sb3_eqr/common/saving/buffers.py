@@ -28,11 +28,12 @@ def write_buffer(file: BinaryIO, buffer: Any, notes: dict[str, Any]) -> None:
                 member.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
 
 
-def read_buffer(file: BinaryIO, like: Any) -> tuple[Any, dict[str, Any]]:
+def read_buffer(file: BinaryIO, like: Any, trust: bool = False) -> tuple[Any, dict[str, Any]]:
     """
     Read the buffer and the notes from a file of :func:`write_buffer`, open for reading.
 
     :param like: a buffer of the same class, for the same spaces and number of environments
+    :param trust: whether to load pickles in it, such as a space of a class of one's own
     :raises ValueError: if the file is truncated, modified, or of another kind
     """
     try:
@@ -53,7 +54,7 @@ def read_buffer(file: BinaryIO, like: Any) -> tuple[Any, dict[str, Any]]:
             resized = {like.buffer_size: n}
             buffer = object.__new__(type(like))
             for name, value in state.items():
-                vars(buffer)[name] = _unpacked(value, expected[name], name, archive, resized)
+                vars(buffer)[name] = _unpacked(value, expected[name], name, archive, resized, trust)
     except (zipfile.BadZipFile, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from error
     check_arguments({name: value for name, value in vars(buffer).items() if name in BUFFER}, BUFFER)
@@ -72,7 +73,7 @@ def _packed(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     return encode(value)
 
 
-def _unpacked(value: Any, like: Any, name: str, archive: zipfile.ZipFile, resized: dict[int, int]) -> Any:
+def _unpacked(value: Any, like: Any, name: str, archive: zipfile.ZipFile, resized: dict[int, int], trust: bool) -> Any:
     """What :func:`_packed` was given. Its kind is that of the same attribute of a new buffer, ``like``."""
     if isinstance(like, np.ndarray):
         shape = like.shape if like.ndim < 2 else (resized.get(like.shape[0], like.shape[0]), *like.shape[1:])
@@ -92,8 +93,8 @@ def _unpacked(value: Any, like: Any, name: str, archive: zipfile.ZipFile, resize
     if type(like) is dict and all(isinstance(key, str) for key in like):
         if value.keys() != like.keys():
             raise ValueError(f"{name} must have the keys {sorted(like)}, got {sorted(value)}")
-        return {key: _unpacked(value[key], item, f"{name}.{key}", archive, resized) for key, item in like.items()}
-    return decode(value)
+        return {key: _unpacked(value[key], item, f"{name}.{key}", archive, resized, trust) for key, item in like.items()}
+    return decode(value, trust)
 
 
 def _store(value: Any, like: FrameStore, name: str, archive: zipfile.ZipFile, resized: dict[int, int]) -> FrameStore:

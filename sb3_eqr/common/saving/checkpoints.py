@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import math
 import pathlib
 import shutil
 import warnings
@@ -32,7 +33,7 @@ def write_checkpoint(
 ) -> pathlib.Path:
     """
     Write a checkpoint and return its path. Call this between two rollouts, in a callback's ``_on_rollout_start``. A checkpoint
-    of the same step is not overwritten.
+    of the same step is not overwritten, unless it is damaged.
 
     :param folder: folder of the checkpoints
     :param notes: additional plain data to store
@@ -43,6 +44,11 @@ def write_checkpoint(
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
     remove_leftovers(folder, f"{PREFIX}*")  # also of other steps, which may never be written again
+    if checkpoint.exists():
+        try:
+            read_manifest(checkpoint)
+        except ValueError:
+            discard(checkpoint)
     with _last_named(folder), atomic_folder(checkpoint) as partial:
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -217,11 +223,10 @@ class ExactCheckpointCallback(BaseCallback):
         self.save_freq = save_freq
         self.save_path = pathlib.Path(save_path)
         self.keep = keep
-        self._last = 0
+        self._last = math.inf  # multiples of save_freq that are written or were passed before
         self._is_called = False  # at the start of rollouts
 
     def _on_training_start(self) -> None:
-        self._last = self.num_timesteps // self.save_freq
         if not hasattr(self.model, "resume"):
             raise ValueError(
                 "ExactCheckpointCallback: the agent must be one of this package, which can resume, got "
@@ -232,11 +237,12 @@ class ExactCheckpointCallback(BaseCallback):
         if unknown := capture(env)[1]:
             warn_of_unknown(unknown)
         warn_of_noise(self.model)
-        old = find_checkpoints(self.save_path)
-        manifest = json.loads((old[-1] / MANIFEST).read_text(encoding="utf-8")) if old else {}
+        manifest = self._last_manifest()
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)
         other = [name for name in theirs if theirs[name] != ours.get(name)]
         step, last = self.model.num_timesteps, manifest.get("num_timesteps", 0)
+        # An earlier call of learn with this callback may have ended where a checkpoint was due.
+        self._last = last // self.save_freq if 0 < last <= step else min(self._last, step // self.save_freq)
         if other:
             why = f"{other[0]} = {decode(theirs[other[0]])!r} there, {decode(ours.get(other[0]))!r} here"
         elif last > step == 0:  # resume would choose theirs, which has more steps
@@ -249,6 +255,13 @@ class ExactCheckpointCallback(BaseCallback):
             f"{self.save_path} must be empty or hold checkpoints of this run, got those of another run ({why}). "
             "Pass another folder, or resume that run."
         )
+
+    def _last_manifest(self) -> dict[str, Any]:
+        """That of the last checkpoint in the folder that is not damaged; empty without one."""
+        for checkpoint in reversed(find_checkpoints(self.save_path)):
+            with suppress(ValueError):
+                return json.loads((checkpoint / MANIFEST).read_text(encoding="utf-8"))
+        return {}
 
     def _on_rollout_start(self) -> None:
         self._is_called = True

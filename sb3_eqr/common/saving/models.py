@@ -282,7 +282,7 @@ class SafeFiles(OffPolicyAlgorithm):
                     raise ValueError("it has changed since it was saved")
                 file.seek(0)
                 if is_ours:
-                    return read_buffer(file, self.replay_buffer)
+                    return read_buffer(file, self.replay_buffer, trust)
                 if not trust:
                     raise ValueError(
                         "it is truncated, or a pickle, and loading a pickle runs the code that it names: "
