@@ -35,6 +35,7 @@ from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.benchmark.statistics import estimate, iqm
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
+from sb3_eqr.eqr_sac import EqRSACPolicy
 
 PIXELS, N_TORQUES = "PixelPendulum-v0", 201
 NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
@@ -45,6 +46,7 @@ ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL 
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
 NARROW_READ: dict[str, Any] = {"latent_hidden_dim": 128, "features_extractor_kwargs": {"features_dim": 128}}
+LEAN: dict[str, Any] = {"group": "T(72)", "n_blocks": 1, "reads_features": False}
 NARROW = {**NARROW_READ, "reads_features": False}
 OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC}
 # name -> arguments of these, or of EqRSAC, whose defaults are those of "none"
@@ -54,8 +56,9 @@ ARMS: dict[str, dict[str, Any]] = {
     "none": {},
     "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
     "t72": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1}},  # as many, without rotation
-    "lean": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1, "reads_features": False}},
-    "lean_64": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1, "reads_features": False}, "latent_batch_size": 64},
+    "lean": {"policy_kwargs": LEAN},
+    "lean_64": {"policy_kwargs": LEAN, "latent_batch_size": 64},
+    "lean_64_layer_norm": {"policy_kwargs": LEAN, "latent_batch_size": 64},
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},
@@ -68,24 +71,35 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 
 
-class LayerNormPolicy(SACPolicy):
-    """SAC's policy with layer norm after each hidden linear layer."""
+class WithLayerNorm:
+    """Mixin, listed before a policy of SAC: layer norm after each hidden linear layer of actor and critics."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        actor = super().make_actor(features_extractor)
-        arch: Any = self.actor_kwargs["net_arch"]
+        actor: Actor = super().make_actor(features_extractor)  # type: ignore[misc]
+        arch: Any = self.actor_kwargs["net_arch"]  # type: ignore[attr-defined]
         actor.latent_pi = nn.Sequential(*create_mlp(actor.features_dim, -1, arch, nn.ReLU, post_linear_modules=[nn.LayerNorm]))
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        critic = super().make_critic(features_extractor)
+        critic: ContinuousCritic = super().make_critic(features_extractor)  # type: ignore[misc]
         first: Any = critic.q_networks[0]
-        arch: Any = self.critic_kwargs["net_arch"]
+        arch: Any = self.critic_kwargs["net_arch"]  # type: ignore[attr-defined]
         for i in range(critic.n_critics):
             made = nn.Sequential(*create_mlp(first[0].in_features, 1, arch, nn.ReLU, post_linear_modules=[nn.LayerNorm]))
             critic.q_networks[i] = made
             setattr(critic, f"qf{i}", made)
         return critic
+
+
+class LayerNormPolicy(WithLayerNorm, SACPolicy):
+    """SAC's policy with layer norm."""
+
+
+class EqRLayerNormPolicy(WithLayerNorm, EqRSACPolicy):
+    """EqRSAC's policy with layer norm."""
+
+
+POLICIES = {"sac_layer_norm": LayerNormPolicy, "lean_64_layer_norm": EqRLayerNormPolicy}
 
 
 class Episodes(BaseCallback):
@@ -141,7 +155,7 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
-    kind: Any = LayerNormPolicy if arm == "sac_layer_norm" else policy
+    kind: Any = POLICIES.get(arm, policy)
     return OTHERS.get(arm, EqRSAC)(kind, env, **given, **shared)
 
 
