@@ -78,13 +78,22 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
     The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries; ``name``
     is that of one of several such pairs in the file.
     """
-    found = yaml.safe_load(file.read_text(encoding="utf-8"))
+    try:
+        found = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"--agents: {file} must be valid YAML, got: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"--agents: {file} must be a mapping, got {found!r:.60}.")
     if name is not None:
         if name not in found:
             raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, map(str, found))}")
+        if "/" in name or "\\" in name:
+            raise ValueError(f"--agents: an agent's name must have no slashes, as it names a folder, got {name!r}.")
         found = found[name]
     label = f"{algo}:{name or file.stem}"
     if not isinstance(found, dict) or "base" not in found or found.keys() - {"base", "changes"}:
+        if name is not None:
+            raise ValueError(f"--agents: {file}: {name!r} must be a mapping with base and changes, got {found!r:.60}.")
         return Agent(label, algo, file)
     beside = file.parent / str(found["base"])
     base = _agent_of_file(algo, beside) if beside.is_file() else find_agent(f"{algo}:{found['base']}")

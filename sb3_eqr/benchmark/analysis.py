@@ -79,7 +79,7 @@ def conclusion(analysis: Analysis) -> list[str]:
     """:return: sentences on what the runs show, the most important first"""
     comparison = analysis.comparison
     sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
-    alike = {agent: analysis.matrices[agent] for agent in comparison.agents if agent not in comparison.differing}
+    alike = {agent: matrix for agent, matrix in analysis.matrices.items() if agent not in comparison.differing}
     best = statistics.distinct_best(alike, analysis.reps)
     if len(comparison.agents) > 2 and best is not None:
         others = "every other one" + (" with the same protocol" if comparison.differing else "")

@@ -7,6 +7,7 @@ import json
 import lzma
 import pathlib
 import re
+import shlex
 from typing import Any
 
 from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
@@ -16,7 +17,8 @@ from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, re
 from sb3_eqr.common.saving.files import atomic_write
 
 SUFFIX = ".jsonl.xz"
-ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path
+ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders of an absolute path in a text,
+WHOLE = re.compile(r"(?<![\w./])/(?:[^/:]+/)+(?=[^/])")  # and of one that may have any letters, in a word of a command line
 
 
 class Checked(BaseModel, strict=True):
@@ -139,8 +141,23 @@ def pack(folder: pathlib.Path, file: pathlib.Path) -> int:
     if file.is_file():
         old, kept = read(file)
         suite, rows = merge(old, suite), [*kept, *rows]
+    rows.sort(key=lambda row: "stopped_at" not in row)  # a finished run is not replaced by one that was stopped
     by_run = {(row["agent"], row["game"], row["seed"]): row for row in rows}
     lines = [{"suite": suite.model_dump()}, *(by_run[run] for run in sorted(by_run))]
     with atomic_write(file, "file") as out:
-        out.write(lzma.compress("".join(ABSOLUTE.sub("", json.dumps(line)) + "\n" for line in lines).encode()))
+        texts = [json.dumps(_without_folders(line), ensure_ascii=False) + "\n" for line in lines]
+        out.write(lzma.compress("".join(texts).encode()))
     return len(by_run)
+
+
+def _without_folders(value: Any, key: str = "") -> Any:
+    """The same plain data, with the last part only of absolute paths in its texts."""
+    if isinstance(value, dict):
+        return {name: _without_folders(item, name) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_without_folders(item) for item in value]
+    if not isinstance(value, str):
+        return value
+    if key == "command":
+        return shlex.join(WHOLE.sub("", word) for word in shlex.split(value))
+    return WHOLE.sub("", value) if value.startswith("/") else ABSOLUTE.sub("", value)

@@ -210,7 +210,10 @@ def read_plan(folder: pathlib.Path) -> list[Run]:
     """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/*/{PLAN}"), key=lambda path: (int(path.parent.name), path)):
-        plan = json.loads(path.read_text(encoding="utf-8"))
+        try:
+            plan = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} must be the plan of a run, got a damaged file ({error}). Remove its folder.") from error
         agent = Agent(plan["agent"], plan["entry"]["algo"], pathlib.Path(plan["entry"]["file"]))
         settings = plan["protocol"], plan["entry"]["hyperparameters"], plan.get("command", ""), plan.get("defaults", {})
         runs.append(Run(path.parent, agent, plan["suite"], plan["game"], plan["seed"], *settings))

@@ -110,16 +110,19 @@ def detectable_difference(first: np.ndarray, second: np.ndarray, reps: int = REP
     """
     The smallest difference between the IQMs of two agents that their runs can detect: half the width of the 95 % interval
     around a difference of 0. It uses the bootstrap's variances times n / (n - 1), because a bootstrap of n runs
-    underestimates them by that factor, and Student's quantile with games (n₁ + n₂ - 2) degrees of freedom. Without both
-    corrections, 2 runs on 3 games would distinguish identical agents in a fifth of all cases.
+    underestimates them by that factor, and Student's quantile with Satterthwaite's degrees of freedom, where each variance
+    has games (n - 1). Without both corrections, 2 runs on 3 games would distinguish identical agents in a fifth of all cases.
 
     :return: the difference in the unit of the scores; NaN if either agent has a single run, whose spread is unknown
     """
     if min(len(first), len(second)) < 2:
         return np.nan
-    variance = sum(np.var(iqm(resample(matrix, reps))) * len(matrix) / (len(matrix) - 1) for matrix in (first, second))
-    freedom = first.shape[1] * (len(first) + len(second) - 2)
-    return float(student.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(variance))
+    lengths = np.array([len(first), len(second)])
+    variances = np.array([np.var(iqm(resample(matrix, reps))) for matrix in (first, second)]) * lengths / (lengths - 1)
+    if not variances.any():
+        return 0.0
+    freedom = variances.sum() ** 2 / (variances**2 / (first.shape[1] * (lengths - 1))).sum()
+    return float(student.ppf((1 + CONFIDENCE) / 2, freedom) * np.sqrt(variances.sum()))
 
 
 def iqm_differences(matrices: Matrices, baseline: str, reps: int = REPS) -> pd.DataFrame:

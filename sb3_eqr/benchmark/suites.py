@@ -1,6 +1,7 @@
 """Suites: the games, steps, preprocessing, evaluation protocol and normalisation of a benchmark."""
 
 import pathlib
+import string
 from collections.abc import Iterable
 from typing import Annotated, Any
 
@@ -88,8 +89,10 @@ class Suite(Strict):
 
     @model_validator(mode="after")
     def _covers_games(self) -> "Suite":
-        if isinstance(self.env_id, str) and "{game}" not in self.env_id and len(self.games) > 1:
-            raise ValueError(f"env_id must contain {{game}}, got {self.env_id!r}.")
+        if isinstance(self.env_id, str):
+            names = {name for _, name, *_ in string.Formatter().parse(self.env_id)} - {None}
+            if names != {"game"} and (names or len(self.games) > 1):
+                raise ValueError(f"env_id must contain {{game}} and no other braces, got {self.env_id!r}.")
         folders = [game.replace("/", "-") for game in self.games]
         if unfit := [game for game, name in zip(self.games, folders, strict=True) if folders.count(name) > 1 or "\\" in name]:
             raise ValueError(f"games must have names that differ as names of folders, got {', '.join(unfit)}.")
@@ -134,9 +137,13 @@ def make_suite(name: str, where: str, entry: dict[str, Any]) -> Suite:
     if not isinstance(entry, dict):
         raise ValueError(f"{where} must be a mapping, got {entry!r}. See docs/benchmark.md.")
     try:
-        return Suite.model_validate({"name": name} | entry)
+        suite = Suite.model_validate({"name": name} | entry)
     except ValidationError as error:
         raise ValueError(f"{where}: {first_mistake(error)}") from error
+    for game in suite.env_kwargs:
+        if game not in suite.games:
+            raise ValueError(f"{where}: env_kwargs: there is no game {game!r}.{nearest_name(game, suite.games)}")
+    return suite
 
 
 def first_mistake(error: ValidationError) -> str:
@@ -211,16 +218,24 @@ def check_registered(suite: str, env_id: str) -> None:
 def merge(old: Suite, new: Suite) -> Suite:
     """
     :return: the new suite, with the games of the old one before its own
-    :raises ValueError: if they are not the same suite
+    :raises ValueError: if they are not the same suite, or their scores have another unit
     """
     if old.name != new.name:
         raise ValueError(
             f"The runs must be of suite {old.name!r}, as those that are there, got {new.name!r}. Use another place."
         )
-    games = [*dict.fromkeys([*old.games, *new.games])]
-    scores = old.normalisation.scores | new.normalisation.scores
-    normalisation = new.normalisation.model_copy(update={"scores": scores})
-    return new.model_copy(update={"games": games, "steps": old.steps | new.steps, "normalisation": normalisation})
+    units = old.normalisation.unit, new.normalisation.unit
+    if len({*units}) == 2:
+        raise ValueError(f"normalisation: unit must be {units[0]!r}, as that of the runs that are there, got {units[1]!r}.")
+    ids = [{game: suite.protocol(game)["env_id"] for game in suite.games} for suite in (old, new)]
+    merged = new.model_dump() | {
+        "games": [*dict.fromkeys([*old.games, *new.games])],
+        "env_id": new.env_id if old.env_id == new.env_id else ids[0] | ids[1],
+        "env_kwargs": old.env_kwargs | new.env_kwargs,
+        "steps": old.steps | new.steps,
+    }
+    merged["normalisation"]["scores"] = old.normalisation.scores | new.normalisation.scores
+    return Suite.model_validate(merged)
 
 
 def write_suite(suite: Suite, path: pathlib.Path) -> None:
@@ -231,4 +246,7 @@ def write_suite(suite: Suite, path: pathlib.Path) -> None:
 
 def read_suite(path: pathlib.Path) -> Suite:
     """Read a suite; raises ValueError if the file does not hold one."""
-    return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    try:
+        return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} must be valid YAML, got: {error}") from error

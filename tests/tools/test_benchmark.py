@@ -22,7 +22,7 @@ from sb3_eqr.benchmark.agents import find_agent, hyperparameters
 from sb3_eqr.benchmark.commands import read_seeds
 from sb3_eqr.benchmark.evaluation import make_game
 from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, with_present_defaults, write_plan
-from sb3_eqr.benchmark.suites import choose, load_suite, read_suite, write_suite
+from sb3_eqr.benchmark.suites import choose, load_suite, make_suite, merge, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.configurations import ZOO_KEYS, with_schedule
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
@@ -283,12 +283,17 @@ def test_the_command_without_its_extra(call, monkeypatch):
         ({"evaluation": {**SUITE["evaluation"], "epsilom": 0}}, "unknown key 'evaluation: epsilom'. Did you mean 'epsilon'"),
         ({"normalisation": {"unit": "x"}}, "normalisation: source must be set, got nothing"),
         ({"games": "CartPole"}, "games: input should be a valid list, got 'CartPole'"),
-        ({"env_id": "CartPole-v1"}, "env_id must contain {game}, got 'CartPole-v1'"),
+        ({"env_id": "CartPole-v1"}, "env_id must contain {game} and no other braces, got 'CartPole-v1'"),
+        ({"env_id": "{game}-{v}"}, "env_id must contain {game} and no other braces, got '{game}-{v}'"),
         ({"evaluation": None}, "evaluation: input should be a valid dictionary or i.*, got None"),
         ({"evaluation": {**SUITE["evaluation"], "n_envs": 0}}, "evaluation: n_envs: input should be greater than 0, got 0"),
         ({"evaluation": {**SUITE["evaluation"], "epsilon": 7}}, "epsilon: input should be less than or equal to 1, got 7"),
         ({"normalisation": {**SUITE["normalisation"], "scores": {}}}, "got none for CartPole, Acrobot"),
         ({"games": ["a/b", "a-b"], "steps": 4}, "games must have names that differ as names of folders, got a/b, a-b"),
+        (
+            {"env_kwargs": {"cartpole": {"render_mode": None}}},
+            "env_kwargs: there is no game 'cartpole'. Did you mean 'CartPole'",
+        ),
         ({"env_id": "{game}-v9"}, "'CartPole-v9' is not registered with gymnasium. Did you mean"),
     ],
 )
@@ -379,6 +384,34 @@ def test_agents_and_their_files():
     assert find_agent("eqr_rainbow").file.parent.name == "zoo_hyperparams"
     assert find_agent("eqr_rainbow:se2+aet").file.name == "se2+aet.yml"  # and not se2+aet+r
     assert find_agent("eqr_rainbow:mlp").name == "eqr_rainbow:mlp+aet+r"
+
+
+@pytest.mark.parametrize(
+    "text, name, message",
+    [
+        ("[", None, r"own.yml must be valid YAML"),
+        ("", "slow", r"own.yml must be a mapping, got None"),
+        ("slow: {learning_rate: 0.5}", "slow", r"'slow' must be a mapping with base and changes, got \{'learning_rate': 0.5"),
+        ("a/b: {base: stock}", "a/b", r"must have no slashes, as it names a folder, got 'a/b'"),
+    ],
+)
+def test_invalid_files_of_agents_raise(tmp_path, text, name, message):
+    (tmp_path / "own.yml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        find_agent(f"dqn:{tmp_path}/own.yml" + ("" if name is None else f":{name}"))
+
+
+def test_suites_of_two_files_are_merged_game_by_game():
+    raw = {key: value for key, value in SUITE.items() if key != "normalisation"}
+    hill = {**raw, "games": ["Hill"], "steps": 9, "env_id": {"Hill": "MountainCar-v0"}}
+    kwargs = {"CartPole": {"sutton_barto_reward": True}}
+    second = make_suite("tiny", "b", hill)
+    with pytest.raises(ValueError, match=r"unit must be 'unit', as that of the runs that are there, got 'raw"):
+        merge(make_suite("tiny", "a", SUITE), second)
+    both = merge(make_suite("tiny", "a", {**raw, "env_kwargs": kwargs}), second)
+    assert both.games == ["CartPole", "Acrobot", "Hill"] and both.protocol("Hill")["env_id"] == "MountainCar-v0"
+    assert both.protocol("CartPole")["env_id"] == "CartPole-v1" and both.steps["Hill"] == 9
+    assert both.protocol("CartPole")["preprocessing"] == {"env_kwargs": kwargs["CartPole"]}
 
 
 def test_several_agents_in_one_file(files):

@@ -514,7 +514,8 @@ def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
     file = tmp_path / "all.jsonl.xz"
 
     def change(result):
-        command = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml".replace("TOP", "/a/b-1")
+        command = "run TOP/runs/here --agents dqn:TOP/settings/a.yml dqn:settings/b.yml 'dqn:/a é/b 1/c.yml:two'"
+        command = command.replace("TOP", "/a/b-1")
         result.update({"command": command} | ({"stopped_at": 7} if result["seed"] == 2 else {}))
 
     first = a_benchmark(tmp_path / "a", {"dqn": SCORES["dqn"]}, change=change)
@@ -526,7 +527,7 @@ def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
     assert found.notes[0] == "6 runs were stopped before their end and are left out."
     raw = {key: rows["raw"].tolist() for key, rows in found.scores.groupby(["agent", "game"])}
     assert raw["dqn", "Pong"] == [7.0, 8.0] and raw["dqn", "Krull"] == [1598.0, 1798.0]
-    assert found.results[0]["command"] == "run here --agents dqn:a.yml dqn:settings/b.yml"
+    assert found.results[0]["command"] == "run here --agents dqn:a.yml dqn:settings/b.yml dqn:c.yml:two"
     assert len(load_scores(file)) == 12 * 6
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ValueError, match="must be a file of sb3-eqr benchmark pack, got another or a damaged one"):

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rliable import library, metrics
+from scipy.stats import ttest_ind
 
 from sb3_eqr.benchmark.statistics import (
     aggregate,
@@ -64,24 +65,25 @@ def test_the_detectable_difference_matches_resampled_experiments():
 def test_the_detectable_difference_of_few_runs_matches_a_t_test(n_runs):
     """The IQM of three runs on one game is their mean, because it trims none."""
     first, second = np.random.default_rng(0).normal(0, [[1.0], [2.0]], (2, n_runs))
-    standard_error = np.sqrt((first.var(ddof=1) + second.var(ddof=1)) / n_runs)
-    critical = {2: 4.303, 3: 2.776}[n_runs]  # Student's t, 2 (n - 1) degrees of freedom, 97.5 %
-    found = detectable_difference(first[:, None], second[:, None], 500)
-    assert found == pytest.approx(critical * standard_error, rel=0.1)  # three standard deviations of the bootstrap
+    low, high = ttest_ind(first, second, equal_var=False).confidence_interval(0.95)
+    found = detectable_difference(first[:, None], second[:, None], 2_000)
+    assert found == pytest.approx((high - low) / 2, rel=0.1)  # the freedom depends on the bootstrap's variances, too
 
 
 def test_the_detectable_difference_with_different_numbers_of_runs():
-    """The runs 0, 0 and 3 have the variance 3, and the error 1 of their mean; the others are equal. 2 + 3 - 2 = 3 degrees."""
+    """The runs 0, 0 and 3 have the variance 3, and the error 1 of their mean; the others are equal. 3 - 1 = 2 degrees."""
     first, second = np.zeros((2, 1)), np.array([[0.0], [0.0], [3.0]])
     for pair in ((first, second), (second, first)):
-        assert detectable_difference(*pair, 2_000) == pytest.approx(3.182, rel=0.05)  # Student's t, 97.5 %
+        assert detectable_difference(*pair, 2_000) == pytest.approx(4.303, rel=0.05)  # Student's t, 97.5 %
+    assert detectable_difference(np.zeros((2, 1)), np.ones((3, 1))) == 0
 
 
 def test_the_detectable_difference_of_several_games_matches_a_t_test():
     """Four games far apart, two runs: the IQM is the mean over the second and third game."""
     rng = np.random.default_rng(0)
-    first, second = rng.normal([-1e6, 0, 1, 1e6], [1, 1, 2, 1], (2, 2, 4))
-    variances = first[:, 1:3].var(axis=0, ddof=1).sum() + second[:, 1:3].var(axis=0, ddof=1).sum()
+    first = rng.normal([-1e6, 0, 1, 1e6], [1, 1, 2, 1], (2, 4))
+    second = first + 5  # with the same spread
+    variances = 2 * first[:, 1:3].var(axis=0, ddof=1).sum()
     critical = 2.306  # Student's t, 4 games times 2 + 2 - 2 degrees of freedom, 97.5 %
     assert detectable_difference(first, second, 500) == pytest.approx(critical * np.sqrt(variances / 2) / 2, rel=0.1)
 
