@@ -10,21 +10,24 @@ earlier agent that EqRSAC equals to rounding, but for the spread of the first re
 """
 
 import argparse
+import inspect
 import json
 import lzma
 import pathlib
 import shutil
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from sb3_contrib import TQC, CrossQ
+from sb3_contrib.crossq.policies import Actor as CrossQActor
+from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
@@ -33,6 +36,8 @@ from experiments import markdown
 from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.benchmark.statistics import estimate, iqm
+from sb3_eqr.common.actor_critic import EqRActorCritic
+from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy, PredictsState, ReadsLatent
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.eqr_sac import EqRSACPolicy
@@ -59,6 +64,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "lean": {"policy_kwargs": LEAN},
     "lean_64": {"policy_kwargs": LEAN, "latent_batch_size": 64},
     "lean_64_layer_norm": {"policy_kwargs": LEAN, "latent_batch_size": 64},
+    "eqr_crossq": {"policy_kwargs": LEAN},
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},
@@ -97,6 +103,36 @@ class LayerNormPolicy(WithLayerNorm, SACPolicy):
 
 class EqRLayerNormPolicy(WithLayerNorm, EqRSACPolicy):
     """EqRSAC's policy with layer norm."""
+
+
+class EqRCrossQActor(ReadsLatent, CrossQActor):
+    """CrossQ's actor, which reads the latent state."""
+
+
+class EqRCrossQCritic(PredictsState, CrossQCritic):
+    """CrossQ's critics, which read the latent state and the predicted next one."""
+
+
+class EqRCrossQPolicy(EqRActorCriticPolicy, CrossQPolicy):
+    """CrossQ's policy with a latent model, and CrossQ's momentum for all optimisers."""
+
+    actor_class = EqRCrossQActor
+    critic_class = EqRCrossQCritic
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"optimizer_kwargs": {"betas": (0.5, 0.999)}, **kwargs})
+
+
+class EqRCrossQ(EqRActorCritic, CrossQ):
+    """CrossQ with a latent model, as EqRSAC: a prototype."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {**EqRSAC.policy_aliases, "MlpPolicy": EqRCrossQPolicy}
+    policy: EqRCrossQPolicy  # type: ignore[assignment]
+
+    def __init__(self, policy: str, env: gym.Env, **kwargs: Any):
+        losses = {"prediction_depth": 2, "aet_coef": 1.0, "symmetry_coef": 0.0, "reward_coef": 1.0, "latent_batch_size": None}
+        of_crossq = {name: p.default for name, p in inspect.signature(CrossQ).parameters.items() if p.default is not p.empty}
+        super().__init__(policy, env, **{**of_crossq, **losses, **kwargs})
 
 
 POLICIES = {"sac_layer_norm": LayerNormPolicy, "lean_64_layer_norm": EqRLayerNormPolicy}
@@ -156,7 +192,7 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
     kind: Any = POLICIES.get(arm, policy)
-    return OTHERS.get(arm, EqRSAC)(kind, env, **given, **shared)
+    return (EqRCrossQ if arm == "eqr_crossq" else OTHERS.get(arm, EqRSAC))(kind, env, **given, **shared)
 
 
 def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool) -> None:
@@ -168,7 +204,7 @@ def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds
             continue
         model: Any = make_agent(arm, task, seed, is_short)
         callbacks: list[BaseCallback] = [Episodes()]
-        if isinstance(model, (EqRSAC, EqRTQC)):
+        if isinstance(model, EqRActorCritic):
             checkpoints = file.with_suffix("")
             if find_checkpoints(checkpoints):
                 model = type(model).resume(checkpoints, make_env(task), device="cpu")
