@@ -61,8 +61,9 @@ class GroupLayer(nn.Module):
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """Map features, (B, F), to K flattened elements, (B, D)."""
-        if th.is_autocast_enabled(features.device.type):  # bfloat16 has no kernels for some maps, and no precision for others
-            with th.autocast(features.device.type, enabled=False):
+        device = features.device.type
+        if th.amp.is_autocast_available(device) and th.is_autocast_enabled(device):
+            with th.autocast(device, enabled=False):  # bfloat16 has no kernels for some maps, and no precision for others
                 return self(features.float())
         params = self.to_algebra(features)  # (B, K * num_params)
         return self.group.element(params.view(-1, self.n_blocks, self.group.num_params)).flatten(1)
