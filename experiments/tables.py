@@ -116,7 +116,7 @@ def last(row: Row, key: str) -> float:
 
 
 MEASURES: dict[str, Callable[[Row], float]] = {
-    "score": lambda row: evaluation_curve(row)[1][-1],
+    "score": lambda row: np.nan if "stopped_at" in row else evaluation_curve(row)[1][-1],
     "end": lambda row: series(row, "return")[1][-1],  # return in training, in the last tenth
     "return": lambda row: np.mean(row["training"]["score"]),
     "goals": lambda row: len(goals(row)),

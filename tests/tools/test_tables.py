@@ -40,6 +40,7 @@ def test_measures_by_hand():
     assert (
         np.isnan(measure(row(stopped_at=59), "20-60")) and np.isnan(measure(row(), "R2")) and np.isnan(measure(row(), "at10"))
     )
+    assert np.isnan(measure(row(stopped_at=59), "score"))  # its last evaluation is none of a trained agent
     assert measure(row(measures={"goals": 7}), "goals") == 7  # what was measured when the run was made
     logged = [{"step": 10, "aet_loss": 0.5}, {"step": 20, "aet_loss": 0.25}]
     assert measure(row(losses=logged), "train/aet_loss") == 0.25
