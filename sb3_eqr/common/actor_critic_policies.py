@@ -341,10 +341,10 @@ class EqRActorCriticPolicy(BasePolicy):
         """As SB3's, for the latent model, too; its moving average stays in eval mode."""
         super().set_training_mode(mode)
         if self.has_latent:
-            modes = {self.encoder: mode, self.latent_model: mode, self.latent_encoder: False, self.latent_target: False}
-            for module, wanted in modes.items():
-                if module.training != wanted:  # SB3 calls this three times per step, which costs 3% otherwise
-                    module.train(wanted)
+            self.encoder.train(mode)
+            self.latent_model.train(mode)
+            self.latent_encoder.eval()
+            self.latent_target.eval()
 
     @property
     def description(self) -> dict[str, str]:

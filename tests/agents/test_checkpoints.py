@@ -148,6 +148,14 @@ def test_a_damaged_checkpoint_is_written_again_by_a_run_resumed_before_it(tmp_pa
     assert EqRQRDQN.resume(second, ChainEnv()).num_timesteps == 40
 
 
+def test_a_folder_of_the_user_with_the_name_of_a_checkpoint_is_kept(tmp_path):
+    mine = tmp_path / "checkpoint-000000000020" / "notes.txt"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(40, ExactCheckpointCallback(20, tmp_path))
+    assert mine.read_text() == "mine"
+
+
 def test_different_runs_cannot_share_a_folder(checkpoint):
     folder = checkpoint.parent
     before = sorted(folder.iterdir())

@@ -250,6 +250,7 @@ def test_periodic_factors_have_cyclic_colours(period, colours):
     states = th.randn(9, 12, generator=th.Generator().manual_seed(0))
     figure = latent_figure(model, states, np.arange(9.0), "angle", period)
     assert {drawn.get_cmap().name for ax in figure.axes[:2] for drawn in ax.collections} == {colours}
+    assert {drawn.get_clim() for ax in figure.axes[:2] for drawn in ax.collections} == {(0, 8) if period is None else (-1, 9)}
 
 
 def test_many_blocks_and_points_in_one_figure():

@@ -44,7 +44,7 @@ def write_checkpoint(
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
     remove_leftovers(folder, f"{PREFIX}*")  # also of other steps, which may never be written again
-    if checkpoint.exists():
+    if (checkpoint / MANIFEST).is_file():  # anything else of this name is the user's
         try:
             read_manifest(checkpoint)
         except ValueError:
