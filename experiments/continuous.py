@@ -65,6 +65,8 @@ ARMS: dict[str, dict[str, Any]] = {
     "lean_64": {"policy_kwargs": LEAN, "latent_batch_size": 64},
     "lean_64_layer_norm": {"policy_kwargs": LEAN, "latent_batch_size": 64},
     "eqr_crossq": {"policy_kwargs": LEAN},
+    "eqr_crossq_no_losses": {"policy_kwargs": LEAN, "prediction_depth": 0},
+    "eqr_crossq_16": {"policy_kwargs": {**LEAN, "group": "T(16)"}},
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},
@@ -192,7 +194,7 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
     kind: Any = POLICIES.get(arm, policy)
-    return (EqRCrossQ if arm == "eqr_crossq" else OTHERS.get(arm, EqRSAC))(kind, env, **given, **shared)
+    return (EqRCrossQ if arm.startswith("eqr_crossq") else OTHERS.get(arm, EqRSAC))(kind, env, **given, **shared)
 
 
 def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool) -> None:
