@@ -410,6 +410,7 @@ def test_a_reference_with_runs_has_intervals(tmp_path, report_of):
     assert rows.at["IQM", "value"] == pytest.approx(metrics.aggregate_iqm(scores)) and rows.at["IQM", "runs"] == 3
     assert rows.at["IQM", "low"] < rows.at["IQM", "value"] < rows.at["IQM", "high"]
     assert "THEIRS is better than dqn" in text_of(page) and "; 3 runs on 3 games" in text_of(page)
+    assert "**0.50** ± 0.50" in page.with_name("table.md").read_text()  # the best on Pong
     with pytest.raises(ValueError, match="--reference must have a name that no agent has, got 'dqn'"):
         compare([tmp_path / "a"], {"dqn": file}, False)
 

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, visualize
 from sb3_eqr.common.saving.plain_data import encode as encode_plain
@@ -70,6 +70,7 @@ class Ring(gym.Env):
 
 
 gym.register("Ring-v0", entry_point=Ring)
+gym.register("Dark-v0", entry_point=lambda unwound=False: Ring(unwound))
 
 
 def make_model(algorithm=EqRQRDQN, policy="MlpPolicy", env=None, group="SO(2)", n_blocks=2, network=None, **kwargs):
@@ -280,6 +281,24 @@ class Pickled(th.nn.ReLU):
     """Not plain data, so a file that names it needs trust."""
 
 
+def test_a_film_is_longer_than_its_predictions(trained, sb3_eqr, tmp_path, monkeypatch):
+    lengths = []
+    monkeypatch.setattr(visualize, "record", lambda model, env, path, n_steps, depth, **_: lengths.append((n_steps, depth)))
+    trained.save(tmp_path / "ring")
+    for depth in ([], ["--depth", 150]):
+        line = ["visualize", tmp_path / "ring.zip", "--env", "Ring-v0", "--steps", 400, "--video", *depth]
+        sb3_eqr(" ".join(map(str, line)))
+    assert lengths == [(200, None), (300, 150)]
+
+
+def test_actions_have_the_names_of_environments_in_other_processes():
+    env = make_vec_env(Ring, 2, vec_env_cls=SubprocVecEnv)
+    try:
+        assert loading.action_names(env, make_model(env=env)) == ["BACK", "ON"]
+    finally:
+        env.close()
+
+
 def test_an_error_names_the_flag_of_the_command(sb3_eqr, tmp_path):
     make_model(network={"activation_fn": Pickled}).save(tmp_path / "ring")
     shown = sb3_eqr(f"visualize {tmp_path}/ring.zip --env Ring-v0", code=2).err
@@ -314,6 +333,8 @@ def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
     assert found.get_attr("render_mode") == [None]
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", env_kwargs={"render_mode": "rgb_array"})))
     assert loading.make_env(loaded, path).get_attr("render_mode") == ["rgb_array"]  # of a file of entries, or after --resume
+    (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Dark-v0", env_kwargs=None, gym_packages=[])))
+    assert loading.make_env(loaded, path, render=True).render_mode is None  # its environment cannot be rendered
     other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
     assert other.num_envs == 2
 
