@@ -6,6 +6,7 @@ earlier agent that EqRSAC equals to rounding, but for the spread of the first re
     python -m experiments.continuous train runs/continuous --tasks Ant-v5 --arms sac none --seeds 0
     python -m experiments.continuous train runs/short --short --tasks HalfCheetah-v5 --arms sac none --seeds 100
     python -m experiments.continuous time
+    python -m experiments.continuous still
     python -m experiments.continuous report docs/results/continuous_gate.xz
 """
 
@@ -237,6 +238,25 @@ def time_steps(task: str, arms: Sequence[str], rounds: int, is_short: bool) -> s
     return markdown(["arm", "ms per step", f"times {arms[0]}"], table)
 
 
+def still(n_episodes: int = 20) -> str:
+    """Mean return of the action 0, episodes weighted by their lengths, as in ``area``."""
+    table = []
+    for task in COMPARED:
+        env, returns = gym.make(task), []
+        action = np.zeros(env.action_space.shape or (), np.float32)
+        for seed in range(n_episodes):
+            env.reset(seed=seed)
+            rewards, is_over = [], False
+            while not is_over:
+                _, reward, terminated, truncated, _ = env.step(action)
+                rewards.append(float(reward))
+                is_over = terminated or truncated
+            returns.append([sum(rewards), len(rewards)])
+        scores, lengths = np.transpose(returns)
+        table.append([task, f"{np.average(scores, weights=lengths):.0f}", f"{np.mean(lengths):.0f}"])
+    return markdown(["task", "return", "steps"], table)
+
+
 def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[str, Any]]]:
     """Runs by seed by (task, arm), from folders of ``train`` and packed files."""
     runs: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
@@ -316,6 +336,7 @@ def main() -> None:
     timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
     timing.add_argument("--rounds", type=int, default=10)
     timing.add_argument("--short", action="store_true", help="with small networks")
+    commands.add_parser("still", help="print the returns of the action 0")
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
     reporting.add_argument(
@@ -334,6 +355,9 @@ def main() -> None:
         return
     if args.command == "time":
         print(time_steps(args.task, args.arms, args.rounds, args.short))
+        return
+    if args.command == "still":
+        print(still())
         return
     runs = read(args.paths)
     if args.pack is not None:
