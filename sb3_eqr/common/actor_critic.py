@@ -79,10 +79,10 @@ class EqRActorCritic(EqROffPolicy):
         validation.check_continuous_actions(action_space)
 
     def _check_arguments(self) -> None:
-        check_arguments(vars(self), RULES)
         validation.check_has_env(self)
         name, given = type(self).__name__, self.replay_buffer_kwargs
         validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
+        check_arguments(vars(self), RULES)  # after the class, because a file may be another agent's
         validation.check_normalization(self._vec_normalize_env, self.observation_space)
         validation.check_replay(name, self.replay_buffer_class, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
         if issubclass(self.replay_buffer_class or SequenceReplayBuffer, PrioritizedSequenceReplayBuffer):

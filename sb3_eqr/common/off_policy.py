@@ -122,7 +122,10 @@ class EqROffPolicy(FiniteData, SafeFiles):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class."""
+        """
+        As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class. At its end, it writes
+        the log once more, with the last updates, unless ``log_interval`` is ``None``.
+        """
         check("total_timesteps", total_timesteps, number(0))
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)

@@ -1,6 +1,7 @@
 """EqRSAC and EqRTQC: SAC and TQC, unchanged, beside a latent model that is trained apart."""
 
 import itertools
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -14,8 +15,9 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-from sb3_eqr import ExactCheckpointCallback, PrioritizedSequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, ExactCheckpointCallback, PrioritizedSequenceReplayBuffer
 from sb3_eqr.common.actor_critic import BeforeSamples
+from sb3_eqr.common.saving import models
 from sb3_eqr.eqr_sac import EqRSAC
 from sb3_eqr.eqr_tqc import EqRTQC
 from tests.models import same, tensors
@@ -528,3 +530,59 @@ def test_a_short_run_and_an_idle_option_are_reported(agent):
         make(agent).learn(20)
     with pytest.warns(UserWarning, match="optimize_memory_usage=True has no effect"):
         make(agent, optimize_memory_usage=True)
+
+
+class Wider(EqRSAC):
+    """An agent of a user, who passes arguments on."""
+
+    def __init__(self, *args, own=1, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.own = own
+
+
+def test_an_agent_derived_by_a_user_loads_with_arguments(tmp_path):
+    make(Wider).save(tmp_path / "own")
+    loaded = Wider.load(tmp_path / "own", learning_rate=1e-4, own=2)
+    assert loaded.learning_rate == 1e-4 and loaded.own == 2
+    with pytest.raises(TypeError, match=r"got an unexpected argument 'learning_rat'\. Did you mean 'learning_rate'"):
+        Wider.load(tmp_path / "own", learning_rat=1e-4)
+
+
+def test_a_buffer_moves_between_agents_and_another_agents_file_is_named(tmp_path):
+    model = make(EqRSAC).learn(60)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = make(EqRTQC)
+    with pytest.warns(UserWarning, match="was saved at step 60"):
+        other.load_replay_buffer(tmp_path / "buffer")
+    assert np.array_equal(other.replay_buffer.rewards, model.replay_buffer.rewards)
+    EqRQRDQN("MlpPolicy", "CartPole-v1", buffer_size=100, device="cpu").save(tmp_path / "discrete")
+    with pytest.raises(ValueError, match=r"EqRSAC: policy must be derived from EqRSACPolicy, got .*EqRQRDQNPolicy"):
+        EqRSAC.load(tmp_path / "discrete")
+
+
+class Backbone(BaseFeaturesExtractor):
+    """Keeps a large module outside of its parameters."""
+
+    def __init__(self, observation_space, n_bytes):
+        super().__init__(observation_space, 3)
+        self.frozen = [th.empty(n_bytes, dtype=th.uint8)]
+
+    def forward(self, observations):
+        return observations
+
+
+def test_an_agent_much_larger_than_its_file_needs_trust(tmp_path, monkeypatch):
+    kwargs = {"features_extractor_class": Backbone, "features_extractor_kwargs": {"n_bytes": 200_000_000}}
+    make(EqRSAC, policy_kwargs=kwargs).save(tmp_path / "large")
+    monkeypatch.setattr(models, "_decoded", lambda path, data, trust, decoded=models._decoded: decoded(path, data, True))
+    with pytest.raises(ValueError, match="much larger than the file"):
+        EqRSAC.load(tmp_path / "large")
+    assert EqRSAC.load(tmp_path / "large", trust=True).policy.encoder is not None
+
+
+def test_unscaled_observations_need_no_statistics():
+    model = make(EqRSAC, VecNormalize(make_vec_env(MoveEnv), norm_obs=False)).learn(40)
+    model.set_env(MoveEnv())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(40)

@@ -18,7 +18,7 @@ class FiniteData(OffPolicyAlgorithm):
     training leaves out no step.
     """
 
-    trained_normalized = False  # whether the last environment was wrapped in VecNormalize; saved with the model
+    trained_normalized = False  # whether VecNormalize scaled the last environment's observations; saved with the model
     _stored_steps = 0  # num_timesteps after the last step that was stored
     _statistics: list[dict[str, Any]]  # of VecNormalize, after the last accepted step
 
@@ -73,7 +73,7 @@ class FiniteData(OffPolicyAlgorithm):
                 f"This agent was trained with VecNormalize, but {found}, so observations are scaled differently. "
                 "Pass VecNormalize.load(path, venv) as env, with the statistics that were saved with the model."
             )
-        self.trained_normalized = self._vec_normalize_env is not None
+        self.trained_normalized = bool(getattr(self._vec_normalize_env, "norm_obs", False))
 
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         """As SB3's; the buffer refuses what is not finite, and then the statistics of VecNormalize are as before."""

@@ -9,7 +9,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, Self
 
 import torch as th
@@ -184,13 +184,12 @@ class SafeFiles(OffPolicyAlgorithm):
         generators are restored, so a run that was saved after ``learn``, or between two rollouts, can be resumed exactly (pass
         ``force_reset=False`` and an environment in the same state). SB3's CheckpointCallback saves in the middle of a step.
 
-        :param trust: whether to load pickled Python objects in the file, which runs any code they name; needed for files with
-            custom classes in ``policy_kwargs``, functions, and for files written by SB3's own ``save``
+        :param trust: whether to load pickled Python objects in the file, which runs any code they name, and agents much larger
+            than their file; needed for files with custom classes in ``policy_kwargs``, or functions
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: if a keyword is not an argument of the agent
         """
-        legal = [*inspect.signature(cls.load).parameters][:-1] + [*inspect.signature(cls.__init__).parameters][3:]
-        check_names(f"{cls.__name__}.load", kwargs, legal)
+        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.load).parameters][:-1] + arguments_of(cls))
         content = read_model(path)
         given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
         data = {name: value for name, value in data_of(content).items() if name not in given}
@@ -202,7 +201,7 @@ class SafeFiles(OffPolicyAlgorithm):
                 "Load it with the class that saved it."
             )
         objects = {**_decoded(path, data, trust), **given}  # instead of SB3's unpickling
-        with LimitedMemory(MEMORY_PER_BYTE * len(content) + LARGEST_DATA):
+        with nullcontext() if trust else LimitedMemory(MEMORY_PER_BYTE * len(content) + LARGEST_DATA):
             file: Any = io.BytesIO(content)
             model = super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
         is_reseeded = "seed" in kwargs or "seed" in given
@@ -245,19 +244,21 @@ class SafeFiles(OffPolicyAlgorithm):
         """
         As SB3's ``load_replay_buffer``; ``truncate_last_traj`` has no effect here.
 
-        :param trust: whether to load a pickle, as written by SB3, which runs any code it names
-        :raises ValueError: if the file is truncated or modified, needs ``trust``, or holds a buffer of another class, of
-            another algorithm, or for other spaces or environments; the model then keeps its current buffer
+        :param trust: whether to load a pickle of such a buffer, as SB3's ``save_to_pkl`` writes it, which runs any code it
+            names
+        :raises ValueError: if the file is truncated or modified, needs ``trust``, or holds a buffer of another class, for
+            other spaces or environments, or with priorities of another algorithm; the model then keeps its current buffer
         """
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         before = self.replay_buffer
         loaded, notes = self._read_replay_buffer(path, trust)
-        expected = {"algorithm": type(self).__name__, **_describe(before)}
-        found = {"algorithm": type(self).__name__, **notes, **_describe(loaded)}
+        name, expected = type(self).__name__, _describe(before)
+        found = {"algorithm": name, **notes, **_describe(loaded)}
+        if hasattr(before, "alpha"):  # priorities are losses of an algorithm; all else that is stored is the environment's
+            expected["algorithm"] = name
         steps = found.pop("num_timesteps", self.num_timesteps)
-        if expected != found:
-            names = [name for name in expected if expected[name] != found.get(name)]
+        if names := [name for name in expected if expected[name] != found.get(name)]:
             differs = ", ".join(f"{name} = {expected[name]}, got {found.get(name)}" for name in names)
             raise ValueError(
                 f"{path} must be a replay buffer with {differs}. Load the one saved with this model, into a model with as "
@@ -296,6 +297,18 @@ class SafeFiles(OffPolicyAlgorithm):
                     f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
                     f"got something else ({error}). Load an earlier one."
                 ) from error
+
+
+def arguments_of(cls: type) -> list[str]:
+    """Names of the arguments of a class but ``policy`` and ``env``, through the ``**kwargs`` of its subclasses."""
+    names: dict[str, None] = {}
+    for base in cls.__mro__:
+        if "__init__" in vars(base):
+            found = inspect.signature(base.__init__).parameters.values()  # type: ignore[misc]
+            names |= {p.name: None for p in found if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+            if not any(p.kind is p.VAR_KEYWORD for p in found):
+                break
+    return [name for name in names if name not in ("self", "policy", "env")]
 
 
 def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:
