@@ -6,10 +6,12 @@ import re
 import shutil
 
 import pytest
+import torch as th
 import yaml
 from stable_baselines3 import DQN
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
+from sb3_eqr.eqr_sac import EqRSACPolicy
 from sb3_eqr.trust import check_zoo_folder, is_plain
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs" / "files.md"
@@ -68,7 +70,13 @@ def test_the_table_is_the_one_that_is_tested():
     rows = re.findall(
         r"^\| (?!what|-)(.*) \| (yes|no)(?:; yes with [^|]*)? \|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE
     )
-    assert [answer for _, answer in rows] == "no no no yes yes yes".split()
+    assert [answer for _, answer in rows] == "no no no yes yes yes yes".split()
+
+
+def test_sb3s_load_of_a_policy_runs_code(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    th.save(Runs(), "policy.pth")
+    assert ran(EqRSACPolicy.load, "policy.pth")
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
