@@ -79,8 +79,8 @@ class EqRRainbow(EqRAlgorithm, DQN):
             warnings.warn(
                 f"step {self.num_timesteps}: a discounted return of {worst:.4g} lies outside the support of the return "
                 f"distribution, [v_min, v_max] = [{v_min}, {v_max}], and is clipped to it. "
-                "Pass policy_kwargs=dict(v_min=..., v_max=...), for example the smallest and largest reward of a step divided "
-                "by 1 - gamma, or scale the rewards (VecNormalize)."
+                "Pass policy_kwargs=dict(v_min=..., v_max=...), for example the smallest and largest of 0 and a step's "
+                "rewards divided by 1 - gamma, or scale the rewards (VecNormalize)."
             )
 
     def _excluded_save_params(self) -> list[str]:
