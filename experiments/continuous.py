@@ -198,9 +198,11 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     return (EqRCrossQ if arm.startswith("eqr_crossq") else OTHERS.get(arm, EqRSAC))(kind, env, **given, **shared)
 
 
-def train(folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool) -> None:
+def train(
+    folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool, steps: int | None
+) -> None:
     """Run what is not in the folder, seed by seed, task by task, arm by arm. EqRSAC's runs can be stopped at any time."""
-    steps = N_SHORT if is_short else N_STEPS
+    steps = steps or (N_SHORT if is_short else N_STEPS)
     for seed, task, arm in ((seed, task, arm) for seed in seeds for task in tasks for arm in arms):
         file = folder / f"{arm}-{task}-{seed}.json"
         if file.exists():
@@ -267,17 +269,19 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
     return runs
 
 
-def report(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, cost: float) -> str:
+def report(
+    runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, cost: float, until: int = N_STEPS
+) -> str:
     """
     Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
     over tasks, bootstrap interval over seeds; and the IQM of all areas, each divided by the baseline's mean. The areas of all
-    but the baseline end after 1 / ``cost`` of the steps.
+    but the baseline end after 1 / ``cost`` of the steps, and all at ``until``.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
     for key, of_key in runs.items():
         share = 1.0 if key[1] == baseline else 1 / cost
-        areas[key] = np.array([area(run, after, share * run["steps"]) for run in of_key.values()])
+        areas[key] = np.array([area(run, after, min(share * run["steps"], until)) for run in of_key.values()])
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
     for arm in ARMS:
@@ -331,6 +335,7 @@ def main() -> None:
     running.add_argument("--arms", nargs="+", default=["sac", "none"], choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
+    running.add_argument("--steps", type=int, help="a beginning of the runs")
     timing = commands.add_parser("time", help="compare the time of a step of learning")
     timing.add_argument("--task", default=TASKS[0])
     timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
@@ -344,6 +349,7 @@ def main() -> None:
     )
     reporting.add_argument("--to", default="sac", choices=list(ARMS), help="the arm whose area is 1")
     reporting.add_argument("--after", type=int, default=0, help="count episodes that end after this step")
+    reporting.add_argument("--until", type=int, default=N_STEPS, help="count episodes that end until this step")
     reporting.add_argument(
         "--cost", type=float, default=1.0, help="compare in the same time, if a step takes so many times as long as that arm's"
     )
@@ -351,7 +357,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.command == "train":
         args.folder.mkdir(parents=True, exist_ok=True)
-        train(args.folder, args.tasks, args.arms, args.seeds, args.short)
+        train(args.folder, args.tasks, args.arms, args.seeds, args.short, args.steps)
         return
     if args.command == "time":
         print(time_steps(args.task, args.arms, args.rounds, args.short))
@@ -366,7 +372,7 @@ def main() -> None:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
         draw(rows(runs, ["none", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
-    print(report(runs, args.to, args.after, args.cost))
+    print(report(runs, args.to, args.after, args.cost, args.until))
 
 
 if __name__ == "__main__":
