@@ -335,7 +335,7 @@ def main() -> None:
     running.add_argument("--arms", nargs="+", default=["sac", "none"], choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
-    running.add_argument("--steps", type=int, help="a beginning of the runs")
+    running.add_argument("--steps", type=int, help="stop after so many steps; a folder of its own is needed")
     timing = commands.add_parser("time", help="compare the time of a step of learning")
     timing.add_argument("--task", default=TASKS[0])
     timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))

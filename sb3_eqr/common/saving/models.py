@@ -189,7 +189,7 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: if a keyword is not an argument of the agent
         """
-        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.load).parameters][:-1] + arguments_of(cls))
+        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.load).parameters][:-1] + _arguments_of(cls))
         content = read_model(path)
         given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
         data = {name: value for name, value in data_of(content).items() if name not in given}
@@ -253,10 +253,10 @@ class SafeFiles(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         before = self.replay_buffer
         loaded, notes = self._read_replay_buffer(path, trust)
-        name, expected = type(self).__name__, _describe(before)
-        found = {"algorithm": name, **notes, **_describe(loaded)}
+        algorithm, expected = type(self).__name__, _describe(before)
+        found = {"algorithm": algorithm, **notes, **_describe(loaded)}
         if hasattr(before, "alpha"):  # priorities are losses of an algorithm; all else that is stored is the environment's
-            expected["algorithm"] = name
+            expected["algorithm"] = algorithm
         steps = found.pop("num_timesteps", self.num_timesteps)
         if names := [name for name in expected if expected[name] != found.get(name)]:
             differs = ", ".join(f"{name} = {expected[name]}, got {found.get(name)}" for name in names)
@@ -299,7 +299,7 @@ class SafeFiles(OffPolicyAlgorithm):
                 ) from error
 
 
-def arguments_of(cls: type) -> list[str]:
+def _arguments_of(cls: type) -> list[str]:
     """Names of the arguments of a class but ``policy`` and ``env``, through the ``**kwargs`` of its subclasses."""
     names: dict[str, None] = {}
     for base in cls.__mro__:
