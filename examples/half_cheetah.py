@@ -124,12 +124,13 @@ def draw(runs: dict[str, Run], curves: dict[str, tuple[list[int], list[float]]],
                 labels[name].set_text(f"{name}: {round(here)} m after {t * STEPS_PER_FRAME * 0.05:.0f} s")
                 for mark, metre in zip(marks[name], round(here) + np.arange(-3, 4), strict=True):
                     mark.set_x(metre - here)
-                    mark.set_text(f"{metre:.0f} m" if abs(metre - here) < HALF_WIDTH - 0.2 and metre % 2 == 0 else "")
+                    mark.set_text(f"{metre:.0f} m" if abs(metre - here) < HALF_WIDTH - 0.5 and metre % 2 == 0 else "")
             return []
 
         figure.canvas.draw()  # the layout, on which the bodies' width in points depends
         figure.set_layout_engine("none")
-        FuncAnimation(figure, frame, frames=N_FRAMES).save(path, writer=PillowWriter(fps=FPS))
+        order = [N_FRAMES - 1, *range(N_FRAMES)]  # where a film does not play, the end shows
+        FuncAnimation(figure, frame, frames=order).save(path, writer=PillowWriter(fps=FPS))
         plt.close(figure)
 
 
