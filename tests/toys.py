@@ -6,6 +6,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+FORK = {"start_method": "fork"}  # of SubprocVecEnv: by default, each process imports PyTorch anew
+
 
 class ChainEnv(gym.Env):
     """A noisy walk whose complete state can be read and set. Episodes end at either side or with a time-out."""

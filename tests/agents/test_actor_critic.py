@@ -364,8 +364,7 @@ def test_a_run_is_repeatable_and_can_be_saved(agent, policy, make_env, kwargs, t
     assert np.array_equal(*answers)
 
 
-@EACH
-@pytest.mark.parametrize("env", ["Pendulum-v1", "MountainCarContinuous-v0"])
+@pytest.mark.parametrize("agent, env", [(EqRSAC, "Pendulum-v1"), (EqRTQC, "MountainCarContinuous-v0")])
 def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
     whole = make(agent, env).learn(120)
     make(agent, env).learn(90, callback=ExactCheckpointCallback(60, tmp_path))

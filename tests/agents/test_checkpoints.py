@@ -19,7 +19,7 @@ from sb3_eqr.common.saving.checkpoints import ExactCheckpointCallback, find_chec
 from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from tests.models import same
-from tests.toys import ChainEnv, SampledEnv
+from tests.toys import FORK, ChainEnv, SampledEnv
 
 STEPS = 160
 SMALL = {"buffer_size": 300, "batch_size": 8, "learning_starts": 40, "n_steps": 3, "seed": 3, "device": "cpu"}
@@ -38,33 +38,34 @@ WORLDS = {
 }
 
 
-def resume(algorithm, folder):
-    """Run in another process: continue from the last checkpoint and save."""
+def resume(folder):
+    """Run in another process: continue from the last checkpoints and save."""
     th.set_num_threads(1)
-    env, *_ = WORLDS[algorithm]
-    model = getattr(sb3_eqr, algorithm).resume(folder, env())
-    callback = ExactCheckpointCallback(30, folder)
-    model.learn(STEPS - model.num_timesteps, callback, reset_num_timesteps=False).save(f"{folder}/resumed")
+    for algorithm, (env, *_) in WORLDS.items():
+        model = getattr(sb3_eqr, algorithm).resume(folder / algorithm, env())
+        callback = ExactCheckpointCallback(30, folder / algorithm)
+        model.learn(STEPS - model.num_timesteps, callback, reset_num_timesteps=False).save(folder / algorithm / "resumed")
 
 
-@pytest.mark.parametrize("algorithm", WORLDS)
-def test_resuming_in_a_new_process_is_bit_identical(algorithm, tmp_path):
-    kind = getattr(sb3_eqr, algorithm)
-    env, policy, settings = WORLDS[algorithm]
-    whole = kind(policy, env(), **{**SMALL, **settings}).learn(STEPS)
-    stopped = kind(policy, env(), **{**SMALL, **settings})
-    stopped.learn(STEPS, ExactCheckpointCallback(30, tmp_path, keep=3))
-    found = sorted(path.name for path in tmp_path.iterdir())
-    assert len(found) == 3 and all(name.startswith("checkpoint-0000000001") for name in found[1:])
-    for later in found[1:]:  # as if the run had been killed after the first checkpoint
-        shutil.rmtree(tmp_path / later)
-    command = f"from tests.agents.test_checkpoints import resume; resume({algorithm!r}, {str(tmp_path)!r})"
+def test_resuming_in_a_new_process_is_bit_identical(tmp_path):
+    models = {}
+    for algorithm, (env, policy, settings) in WORLDS.items():
+        kind, folder = getattr(sb3_eqr, algorithm), tmp_path / algorithm
+        whole = kind(policy, env(), **{**SMALL, **settings}).learn(STEPS)
+        stopped = kind(policy, env(), **{**SMALL, **settings}).learn(STEPS, ExactCheckpointCallback(30, folder, keep=3))
+        models[algorithm] = whole, stopped
+        found = sorted(path.name for path in folder.iterdir())
+        assert len(found) == 3 and all(name.startswith("checkpoint-0000000001") for name in found[1:])
+        for later in found[1:]:  # as if the run had been killed after the first checkpoint
+            shutil.rmtree(folder / later)
+    command = f"import pathlib; from tests.agents.test_checkpoints import resume; resume(pathlib.Path({str(tmp_path)!r}))"
     subprocess.run([sys.executable, "-c", command], check=True)
-    resumed = kind.load(tmp_path / "resumed")
-    for model in (stopped, resumed):
-        assert model.num_timesteps == whole.num_timesteps and model._n_updates == whole._n_updates > 20
-        assert same(model, whole)
-    assert not list(tmp_path.glob(".*"))
+    for algorithm, (whole, stopped) in models.items():
+        resumed = type(whole).load(tmp_path / algorithm / "resumed")
+        for model in (stopped, resumed):
+            assert model.num_timesteps == whole.num_timesteps and model._n_updates == whole._n_updates > 20
+            assert same(model, whole)
+        assert not list((tmp_path / algorithm).glob(".*"))
 
 
 @pytest.fixture
@@ -235,7 +236,7 @@ def test_a_run_with_arrays_among_its_arguments_goes_on_in_its_folder(tmp_path):
 
 
 def cartpoles():
-    return make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
+    return make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORK, wrapper_class=ResumableWrapper)
 
 
 def test_environments_in_other_processes_are_resumed_exactly(tmp_path):
@@ -248,7 +249,7 @@ def test_environments_in_other_processes_are_resumed_exactly(tmp_path):
     resumed.learn(120 - resumed.num_timesteps, reset_num_timesteps=False)
     env.close()
     assert resumed._n_updates == whole._n_updates > 20 and same(resumed, whole)
-    bare = make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv)
+    bare = make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORK)
     with pytest.raises(ValueError, match=r"env must be Monitor in .*got SubprocVecEnv: the environment is not built as in"):
         EqRQRDQN.resume(tmp_path, bare)
     bare.close()

@@ -14,7 +14,7 @@ from sb3_eqr import envs
 from sb3_eqr.common.saving.env_state import ATTRIBUTES, capture, restore
 from sb3_eqr.envs import ResumableWrapper
 from sb3_eqr.envs.minatar import GAMES, ChannelsFirstImage
-from tests.toys import ChainEnv, DictEnv, ImageEnv
+from tests.toys import FORK, ChainEnv, DictEnv, ImageEnv
 
 TORUS = {"goal": [0.5, 0.5], "n_distractors": 2}
 
@@ -41,7 +41,7 @@ IDS = ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", "Taxi-v4", "CliffWalking
 WORLDS = {
     "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 4, seed)),
     "processes": lambda seed: VecNormalize(
-        make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
+        make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORK, wrapper_class=ResumableWrapper)
     ),
     "statistics": lambda seed: VecMonitor(DummyVecEnv([lambda: timed(gym.make("CartPole-v1"))])),
     **{name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in IDS},
@@ -97,7 +97,7 @@ def test_an_unknown_class_is_named_and_its_wrappers_are_restored(make):
     assert unknown == [f"tests.toys.{make.__name__}"]
     restore(second, state, wrappers_only=True)
     assert second.ret_rms.count == first.ret_rms.count > 1
-    hidden = SubprocVecEnv([make])
+    hidden = SubprocVecEnv([make], **FORK)
     assert capture(hidden)[1] == ["stable_baselines3.common.vec_env.subproc_vec_env.SubprocVecEnv"]
     hidden.close()
 

@@ -437,7 +437,9 @@ def test_two_commands_can_plan_games_in_one_folder(tmp_path, monkeypatch):
 
 def test_an_agent_with_a_class_of_its_own_resumes(own_extractor, tmp_path):
     """Its checkpoint holds a pickle of the class, which the entry has already run."""
-    entry = "{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, "
+    entry = (
+        "{policy: MlpPolicy, n_timesteps: 1000, prediction_depth: 0, learning_starts: 40, train_freq: 20, gradient_steps: 1, "
+    )
     entry += f'policy_kwargs: "{own_extractor}"}}'
     run = make_run(tmp_path, "eqr_qrdqn", entry)
     interrupt(run, 100)

@@ -29,6 +29,7 @@ from sb3_eqr.visualize.latents import encode, play
 from sb3_eqr.visualize.pictures import all_pictures, generators_figure, latent_figure
 from sb3_eqr.visualize.tables import all_tables
 from tests.models import PAPER_FLAT
+from tests.toys import FORK
 
 STEP = 0.4
 FILES = ("transition", "motion", "generators", "disentanglement", "action_symmetry", "collapse", "rewards", "summary")
@@ -290,7 +291,7 @@ def test_a_film_is_longer_than_its_predictions(trained, sb3_eqr, tmp_path, monke
 
 
 def test_actions_have_the_names_of_environments_in_other_processes():
-    env = make_vec_env(Ring, vec_env_cls=SubprocVecEnv)
+    env = make_vec_env(Ring, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORK)
     try:
         assert loading.action_names(env, make_model(env=env)) == ["BACK", "ON"]
     finally:
