@@ -6,7 +6,6 @@ import re
 from typing import Any, NamedTuple
 
 import rl_zoo3
-import yaml
 from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 
@@ -14,7 +13,7 @@ import sb3_eqr
 from sb3_eqr.benchmark.suites import nearest_name
 from sb3_eqr.configurations import STOCK, configuration_files, merged
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry
+from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry, read_yaml
 
 WORLD = ("env_wrapper", "frame_stack", "env_kwargs", "vec_env_wrapper")  # keys of entries that change the environment
 OFF = "off"
@@ -78,12 +77,7 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
     The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries; ``name``
     is that of one of several such pairs in the file.
     """
-    try:
-        found = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"--agents: {file} must be valid YAML, got: {error}") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"--agents: {file} must be a mapping, got {found!r:.60}.")
+    found = read_yaml(file)
     if name is not None:
         if name not in found:
             raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, map(str, found))}")

@@ -20,24 +20,18 @@ FEW_RUNS = 5  # with fewer, the intervals of the percentile bootstrap are far to
 
 @dataclasses.dataclass(frozen=True)
 class Analysis:
-    """
-    :param comparison: the runs compared
-    :param matrices: agent or reference -> (runs, games), normalised scores, games in alphabetical order
-    :param means: rows games, columns published methods, raw mean scores; no columns where a run's steps differ from the
-        published methods', the suite is not normalised by human scores, or a game has no published score
-    :param aggregates: columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"),
-        protocol_differs: the metrics that mean something, and the number of games above 1
-    :param differences: differences of IQMs from the first agent and from the best, see
-        :func:`~sb3_eqr.benchmark.statistics.iqm_differences`
-    :param reps: bootstrap samples behind all intervals
-    """
+    """The runs compared, and their statistics."""
 
     comparison: Comparison
-    matrices: dict[str, np.ndarray]
+    matrices: dict[str, np.ndarray]  # agent or reference -> (runs, games), normalised scores, games in alphabetical order
+    # Rows games, columns published methods, raw mean scores; no columns where a run's steps differ from the published
+    # methods', the suite is not normalised by human scores, or a game has no published score.
     means: pd.DataFrame
+    # Columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs: the metrics
+    # that mean something, and the number of games above 1.
     aggregates: pd.DataFrame
-    differences: pd.DataFrame
-    reps: int
+    differences: pd.DataFrame  # of the IQMs from the first agent and from the best, see iqm_differences
+    reps: int  # bootstrap samples behind all intervals
 
 
 def analyse(comparison: Comparison, reps: int) -> Analysis:

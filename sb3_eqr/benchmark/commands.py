@@ -16,8 +16,8 @@ from sb3_eqr.benchmark.dispatch import Processes, finish, last_line, make_table
 from sb3_eqr.benchmark.packed import pack
 from sb3_eqr.benchmark.runs import ERROR, Run, Settings, plan_runs, read_plan, with_present_defaults, write_plan
 from sb3_eqr.benchmark.selection import never_learn
-from sb3_eqr.benchmark.suites import check_registered, choose, load_suite
-from sb3_eqr.envs import import_packages
+from sb3_eqr.benchmark.suites import choose, load_suite
+from sb3_eqr.envs import check_registered, import_packages
 from sb3_eqr.zoo.checks import check_device, fail
 
 
@@ -83,7 +83,7 @@ def make_plan(args: argparse.Namespace) -> list[Run]:
                 raise ValueError(f"--{flag} needs --suite and --agents. FOLDER alone resumes the runs in it.")
         runs = with_present_defaults(read_plan(args.folder))
         for planned in runs:
-            check_registered(planned.suite, planned.protocol["env_id"])
+            check_registered(planned.protocol["env_id"], f"suite {planned.suite!r}")
         return runs
     if args.suite is None or args.agents is None:
         raise ValueError("--suite and --agents must be given together. Without both, FOLDER resumes the runs in it.")

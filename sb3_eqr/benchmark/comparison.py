@@ -19,29 +19,18 @@ from sb3_eqr.benchmark.suites import RAW, Suite, nearest_name
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """
-    :param suite: name of the suite; several names are joined by "+"
-    :param unit: unit of the normalised scores
-    :param source: source of the bounds that scores are normalised by
-    :param bounds: game -> (score that becomes 0, score that becomes 1)
-    :param games: games that every agent has runs on, in the suite's order
-    :param agents: agents of the benchmark; the first is the baseline
-    :param scores: columns agent, game, seed, raw, score (normalised); the runs compared, of agents and references
-    :param results: result.json of those runs
-    :param differing: agent -> how its protocol differs from the others', where the comparison was forced
-    :param notes: sentences on what was left out and why
-    """
+    """What benchmark folders have in common."""
 
-    suite: str
-    unit: str
-    source: str
-    bounds: dict[str, tuple[float, float]]
-    games: list[str]
-    agents: list[str]
-    scores: pd.DataFrame
-    results: list[dict[str, Any]]
-    differing: dict[str, str]
-    notes: list[str]
+    suite: str  # its name; several names are joined by "+"
+    unit: str  # of the normalised scores
+    source: str  # of the bounds that scores are normalised by
+    bounds: dict[str, tuple[float, float]]  # game -> (score that becomes 0, score that becomes 1)
+    games: list[str]  # that every agent has runs on, in the suite's order
+    agents: list[str]  # of the benchmark; the first is the baseline
+    scores: pd.DataFrame  # columns agent, game, seed, raw, score (normalised); the runs compared, of agents and references
+    results: list[dict[str, Any]]  # result.json of those runs
+    differing: dict[str, str]  # agent -> how its protocol differs from the others', where the comparison was forced
+    notes: list[str]  # sentences on what was left out and why
 
     @property
     def human(self) -> bool:

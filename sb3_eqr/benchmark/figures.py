@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import seaborn as sns
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rliable import plot_utils
 
@@ -24,20 +25,15 @@ from sb3_eqr.plot_style import GREY, INK, SETTINGS, Look, looks, styled
 
 DPI = 160
 N_THRESHOLDS = 81  # points of a performance profile
-SIZES: Any = {"labelsize": "medium", "ticklabelsize": "medium"}  # rliable's defaults are for slides
 INTERVALS = "95% stratified bootstrap intervals"
 
 
 class ReportFigure(NamedTuple):
-    """
-    :param name: name of the file, without suffix
-    :param title: heading in the report
-    :param caption: plain text
-    """
+    """A figure with its texts."""
 
-    name: str
-    title: str
-    caption: str
+    name: str  # of the file, without suffix
+    title: str  # heading in the report
+    caption: str  # plain text
     figure: Figure
 
 
@@ -86,23 +82,20 @@ def thresholds(matrices: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.linspace(low, max(1.0, low + 1.0, 1.05 * float(np.quantile(scores, 0.975))), N_THRESHOLDS)
 
 
+def _draw(ax: Axes, x: np.ndarray, found: statistics.Estimate, look: Look, **marks: Any) -> None:
+    """Draw a curve with the band of its intervals."""
+    value, low, high = found
+    ax.plot(x, value, color=look.color, linestyle=look.line, marker=look.marker, **marks)
+    ax.fill_between(x, low, high, color=look.color, alpha=0.2)
+
+
 def _profiles(analysis: Analysis, style: Mapping[str, Look]) -> ReportFigure:
-    taus, label = thresholds(analysis.matrices), analysis.comparison.label
+    taus = thresholds(analysis.matrices)
     figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    found = {label(a): statistics.performance_profile(m, taus, analysis.reps) for a, m in analysis.matrices.items()}
-    plot_utils.plot_performance_profiles(
-        {agent: value for agent, (value, _, _) in found.items()},
-        taus,
-        {agent: ends for agent, (_, *ends) in found.items()},
-        ax=ax,
-        colors={agent: look.color for agent, look in style.items()},
-        linestyles={agent: look.line for agent, look in style.items()},
-        xlabel=f"score τ ({analysis.comparison.unit})",
-        ylabel="fraction of runs above τ",
-        **SIZES,
-    )
-    for line, look in zip(ax.get_lines(), style.values(), strict=True):
-        line.set(marker=look.marker, markevery=N_THRESHOLDS // 8)
+    for look, matrix in zip(style.values(), analysis.matrices.values(), strict=True):
+        _draw(ax, taus, statistics.performance_profile(matrix, taus, analysis.reps), look, markevery=N_THRESHOLDS // 8)
+    ax.set(xlabel=f"score τ ({analysis.comparison.unit})", ylabel="fraction of runs above τ", yticks=np.linspace(0, 1, 5))
+    ax.grid(alpha=0.2)
     _legend(figure, style)
     caption = "Fraction of runs that score above τ, as Figure 4 of the EqR paper. Higher curves are better."
     return ReportFigure("profiles", "Performance profiles", caption + _bands(analysis, "Bands are pointwise"), figure)
@@ -169,25 +162,11 @@ def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[Re
     steps = {result["protocol"]["steps"] for result in comparison.results}
     whole, axis = (steps.pop() / 1_000, "training steps (thousands)") if len(steps) == 1 else (1.0, "fraction of the steps")
     figure, ax = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    shown = {}
-    for agent, (fractions, scores) in curves.items():
-        value, low, high = statistics.sample_efficiency(scores, analysis.reps)
-        label = comparison.label(agent)
-        shown[label] = look = style[label]
-        plot_utils.plot_sample_efficiency_curve(
-            fractions * whole,
-            {label: value},
-            {label: (low, high)},
-            colors={label: look.color},
-            ax=ax,
-            xlabel=axis,
-            ylabel=f"IQM ({comparison.unit})",
-            marker=look.marker,
-            linewidth=1.5,
-            **SIZES,
-        )
-        ax.get_lines()[-1].set_linestyle(look.line)
-    ax.set_xlim(left=0)
+    shown = {label: style[label] for label in map(comparison.label, curves)}
+    for look, (fractions, scores) in zip(shown.values(), curves.values(), strict=True):
+        _draw(ax, fractions * whole, statistics.sample_efficiency(scores, analysis.reps), look)
+    ax.set(xlabel=axis, ylabel=f"IQM ({comparison.unit})", xlim=(0, None))
+    ax.grid(alpha=0.2)
     _legend(figure, shown)
     caption = "IQM of the evaluations during training; the last point is the final evaluation."
     caption += _bands(analysis, "Bands are pointwise")

@@ -31,14 +31,9 @@ def write_report(
     reps: int = REPS,
 ) -> pathlib.Path:
     """
-    Write report.html, its figures as PNG, table.md and aggregates.csv.
+    Write report.html, its figures as PNG, table.md and aggregates.csv, with the other parameters of :func:`compare`.
 
-    :param folders: folders of benchmarks, with suite.yml and runs/, or files of ``sb3-eqr benchmark pack``
-    :param references: name -> JSON file with the runs of another method, game -> raw scores
-    :param force: also compare agents with different protocols, which are marked, or with missing games
     :param output: output folder, created if needed
-    :param agents: the agents to compare; empty: all
-    :param baseline: the agent that the others are compared with; ``None``: the first stock one, or else the first
     :param command: the command line of the report
     :param reps: bootstrap samples behind every interval
     :return: the path of report.html

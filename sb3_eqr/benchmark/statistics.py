@@ -57,18 +57,13 @@ def estimate(function: Callable[[np.ndarray], np.ndarray], matrix: np.ndarray, r
 
 def score_matrices(scores: pd.DataFrame) -> dict[str, np.ndarray]:
     """
-    :param scores: columns agent, game, seed, score; the scores normalised
+    :param scores: columns agent, game, seed, score; the scores normalised; each agent has the same seeds on every game
     :return: agent -> (runs, games), games in alphabetical order
-    :raises ValueError: if an agent's number of runs differs between games
     """
-    matrices = {}
-    for agent, rows in scores.groupby("agent", sort=False):
-        table = rows.pivot(index="seed", columns="game", values="score").reindex(columns=sorted(scores["game"].unique()))
-        if table.isna().any(axis=None):
-            counts = ", ".join(f"{game}: {count}" for game, count in table.count().items())
-            raise ValueError(f"{agent} must have the same number of runs on every game, got {counts}.")
-        matrices[str(agent)] = np.ascontiguousarray(table)
-    return matrices
+    return {
+        str(agent): np.ascontiguousarray(rows.pivot(index="seed", columns="game", values="score"))
+        for agent, rows in scores.groupby("agent", sort=False)
+    }
 
 
 def aggregate(matrices: Matrices, reps: int = REPS, seed: int = 0) -> pd.DataFrame:

@@ -5,7 +5,6 @@ import string
 from collections.abc import Iterable
 from typing import Annotated, Any
 
-import gymnasium as gym
 import yaml
 from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError, field_validator, model_validator
@@ -13,7 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, Val
 from sb3_eqr.benchmark.reference import HUMAN, RANDOM, load_reference
 from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.files import atomic_write
-from sb3_eqr.zoo.checks import SIMILAR
+from sb3_eqr.envs import check_registered
+from sb3_eqr.zoo.entries import read_yaml
 
 RAW = "raw score"  # the unit of scores that are not normalised
 OWN_SUITES = pathlib.Path(__file__).with_name("suites.yml")
@@ -168,17 +168,11 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     :param file: an additional file of suites, which override ours of the same name
     :raises ValueError: for an unknown suite, with the nearest name, or an invalid one
     """
-    entries = {key: (OWN_SUITES, entry) for key, entry in yaml.safe_load(OWN_SUITES.read_text(encoding="utf-8")).items()}
+    entries = {key: (OWN_SUITES, entry) for key, entry in read_yaml(OWN_SUITES).items()}
     if file is not None:
         if not file.is_file():
             raise ValueError(f"--suite-file: there is no file {file}")
-        try:
-            own = yaml.safe_load(file.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ValueError(f"--suite-file must be valid YAML, got {file}: {error}") from error
-        if not isinstance(own, dict):
-            raise ValueError(f"{file} must be a mapping of suites by name, got {type(own).__name__}. See docs/benchmark.md.")
-        entries |= {key: (file, entry) for key, entry in own.items()}
+        entries |= {key: (file, entry) for key, entry in read_yaml(file).items()}
     if name not in entries:
         nearby = nearest_name(name, entries)
         raise ValueError(f"--suite: there is no suite {name!r}.{nearby} --suite-file FILE adds suites of your own.")
@@ -200,19 +194,9 @@ def choose(suite: Suite, games: list[str] | None, steps: int | None, episodes: i
     kept = [game for game in suite.games if game.lower() in map(str.lower, wanted)]
     per_game = suite.steps if steps is None else dict.fromkeys(kept, steps)
     for game in kept:
-        check_registered(suite.name, suite.protocol(game)["env_id"])
+        check_registered(suite.protocol(game)["env_id"], f"suite {suite.name!r}")
     evaluation = suite.evaluation if episodes is None else suite.evaluation.model_copy(update={"episodes": episodes})
     return suite.model_copy(update={"games": kept, "steps": per_game, "evaluation": evaluation})
-
-
-def check_registered(suite: str, env_id: str) -> None:
-    """Raise ValueError if an environment of a suite is unknown to gymnasium."""
-    if env_id not in gym.registry:
-        raise ValueError(
-            f"suite {suite!r}: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, SIMILAR)} "
-            "Environments of another package need --gym-packages PACKAGE, also to resume, and a file of yours its folder in "
-            'PYTHONPATH; Atari needs pip install ".[atari]" in a clone of the repository.'
-        )
 
 
 def merge(old: Suite, new: Suite) -> Suite:
@@ -246,7 +230,4 @@ def write_suite(suite: Suite, path: pathlib.Path) -> None:
 
 def read_suite(path: pathlib.Path) -> Suite:
     """Read a suite; raises ValueError if the file does not hold one."""
-    try:
-        return Suite.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} must be valid YAML, got: {error}") from error
+    return Suite.model_validate(read_yaml(path))

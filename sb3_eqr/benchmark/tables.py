@@ -15,13 +15,10 @@ from sb3_eqr.benchmark.statistics import METRICS, distinct_best
 
 
 class Table(NamedTuple):
-    """
-    :param cells: strings; a second line is a spread or an interval
-    :param bold: mask of the cells in bold, of the same shape
-    """
+    """The cells of a table, and which of them are in bold."""
 
-    cells: pd.DataFrame
-    bold: pd.DataFrame
+    cells: pd.DataFrame  # strings; a second line is a spread or an interval
+    bold: pd.DataFrame  # mask of the same shape
 
     def emphasised(self, before: str, after: str) -> pd.DataFrame:
         """:return: the cells, with ``before`` and ``after`` around the first line of bold ones"""

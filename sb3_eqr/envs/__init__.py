@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.saving.env_state import ResumableWrapper
 from sb3_eqr.envs import minatar
 from sb3_eqr.envs.atari import make_atari100k_env
@@ -52,6 +53,17 @@ def import_packages(packages: Iterable[str]) -> None:
                 f"--gym-packages: {package!r} cannot be imported ({error}). Install it, correct the name, or add its folder "
                 "to PYTHONPATH."
             ) from error
+
+
+def check_registered(env_id: str, where: str) -> None:
+    """Raise ValueError, with ``where`` before its message, if an environment is unknown to gymnasium."""
+    if env_id not in gym.registry:
+        similar = nearest(env_id, gym.registry, cutoff=0.8)  # "-v0" alone makes any two alike
+        raise ValueError(
+            f"{where}: {env_id!r} is not registered with gymnasium.{similar} Environments of another package need "
+            "--gym-packages PACKAGE, also to resume, and a file of yours its folder in PYTHONPATH; Atari needs pip install "
+            '".[atari]" in a clone of the repository.'
+        )
 
 
 __all__ = [

@@ -1,22 +1,18 @@
 """Load a saved agent and the environment that it was trained in."""
 
 import ast
-import importlib
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
-import yaml
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
-import sb3_eqr.envs
 from sb3_eqr import AGENTS
-from sb3_eqr.common.checks.arguments import nearest
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.models import data_of, read_model
-from sb3_eqr.trust import check_statistics, check_zoo_folder
+from sb3_eqr.envs import check_registered, import_packages, make_atari100k_env
+from sb3_eqr.trust import check_statistics, check_zoo_folder, read_trusted
 from sb3_eqr.visualize.latents import FACTOR_KEYS, as_vec_env
 
 
@@ -61,7 +57,6 @@ def make_env(
     env_kwargs: dict[str, Any] | None = None,
     n_envs: int = 1,
     seed: int = 0,
-    render: bool = False,
     trust: bool = False,
     packages: Sequence[str] = (),
 ) -> VecEnv:
@@ -75,7 +70,6 @@ def make_env(
     :param env_kwargs: arguments of the environment's constructor
     :param n_envs: number of environments
     :param seed: seed of the first environment
-    :param render: whether the environment is made to render
     :param trust: whether the files next to the model may name code that runs
     :param packages: packages whose code they may name in any case
     :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
@@ -83,15 +77,17 @@ def make_env(
     """
     kwargs = env_kwargs or {}
     folders = [file.parent for file in sorted(path.parent.glob("*/args.yml")) if (file.parent / "config.yml").is_file()]
-    arguments = _zoo_arguments(folders[0], trust, packages) if folders else {}
+    if folders and not trust:
+        check_zoo_folder(folders[0], packages)
+    arguments = read_trusted(folders[0] / "args.yml") if folders else {}
     if folders and env_id in (None, arguments["env"]):
-        env = _zoo_env(folders[0], arguments, kwargs, n_envs, seed, render)
+        env = _zoo_env(folders[0], arguments, kwargs, n_envs, seed)
     elif env_id is None:
         raise ValueError(f"--env must be the agent's environment, got none, and RL Zoo's args.yml is not next to {path}.")
     elif env_id.startswith("ALE/") or "NoFrameskip" in env_id:
         if kwargs:
             raise ValueError(f"--env-kwargs must be empty for Atari, whose protocol is fixed, got {kwargs}.")
-        env = sb3_eqr.envs.make_atari100k_env(env_id, n_envs, seed, training=True)
+        env = make_atari100k_env(env_id, n_envs, seed, training=True)
     else:
         env = _plain_env(env_id, kwargs, n_envs, seed)
     statistics = path.parent / "vecnormalize.pkl"
@@ -104,52 +100,27 @@ def make_env(
     return as_vec_env(model, env)
 
 
-def _zoo_arguments(folder: pathlib.Path, trust: bool, packages: Sequence[str]) -> dict[str, Any]:
-    """The arguments of ``train``, loaded as RL Zoo does, once the folder has been checked or is trusted."""
-    if not trust:
-        check_zoo_folder(folder, packages)
-    return yaml.load((folder / "args.yml").read_text(encoding="utf-8"), Loader=yaml.UnsafeLoader)
-
-
-def _zoo_env(
-    folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, Any], n_envs: int, seed: int, render: bool
-) -> VecEnv:
+def _zoo_env(folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
     """The environment of the run whose arguments of ``train`` and config.yml are in a folder."""
     try:
         import rl_zoo3.import_envs  # noqa: F401 - registers Atari and others
-        from rl_zoo3.utils import create_test_env, get_saved_hyperparams
+        from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
     except ImportError as error:
         advice = 'Run pip install ".[zoo]" in a clone of the repository.'
         raise ImportError(f"{folder} needs RL Zoo, which is not installed ({error}). {advice}") from error
-    for package in arguments.get("gym_packages") or []:
-        importlib.import_module(package)
-    hyperparams, stats_path = get_saved_hyperparams(str(folder))
-    norm_reward = (hyperparams.get("normalize_kwargs") or {}).get("norm_reward", True)
-    made_with = {**(hyperparams.pop("env_kwargs", None) or {}), **(arguments.get("env_kwargs") or {})}
-    made_with |= {**({"render_mode": "rgb_array"} if render else {}), **kwargs}
-    options: dict[str, Any] = {"should_render": False, "vec_env_cls": DummyVecEnv}
-
-    def make(**env_kwargs: Any) -> VecEnv:
-        given = {**options, "env_kwargs": env_kwargs, "hyperparams": dict(hyperparams)}  # which it changes
-        return create_test_env(arguments["env"], n_envs, stats_path, seed, **given)
-
-    try:
-        env = make(**made_with)
-    except TypeError as error:
-        if "render_mode" not in str(error) or "render_mode" in kwargs:
-            raise
-        env = make(**{key: value for key, value in made_with.items() if key != "render_mode"})
-    if (normalize := unwrap_vec_normalize(env)) is not None:
-        normalize.norm_reward = norm_reward  # the reward predictor was trained on these rewards
-    return env
+    import_packages(arguments.get("gym_packages") or [])
+    config, _ = get_saved_hyperparams(str(folder))
+    made_with = {**(config.get("env_kwargs") or {}), **(arguments.get("env_kwargs") or {}), **kwargs}
+    wrap, wrap_all = get_wrapper_class(config), get_wrapper_class(config, "vec_env_wrapper")
+    env: Any = make_vec_env(arguments["env"], n_envs, seed, wrapper_class=wrap, env_kwargs=made_with)  # renders, where it can
+    env = env if wrap_all is None else wrap_all(env)
+    if config["normalize"]:
+        env = VecNormalize.load(str(folder / "vecnormalize.pkl"), env)  # the reward predictor was trained on its rewards
+    return VecFrameStack(env, config["frame_stack"]) if config.get("frame_stack") else env
 
 
 def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
-    if env_id not in gym.registry:
-        raise ValueError(
-            f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, cutoff=0.8)} "
-            "Environments of another package need --gym-packages PACKAGE."
-        )
+    check_registered(env_id, "--env")
     try:
         return make_vec_env(env_id, n_envs, seed, env_kwargs=kwargs)  # sets render_mode where supported
     except TypeError as error:

@@ -149,13 +149,7 @@ def prepare_resuming(args: argparse.Namespace) -> list[str]:
         with failing("--resume: "):
             _, manifest = read_manifest(checkpoints_of(args.resume))
         seed = manifest["settings"].get("seed")
-    train.ExperimentManager = partial(  # type: ignore[misc, assignment]
-        ResumableExperiment,
-        checkpoint_every=args.checkpoint_every,
-        resume=args.resume,
-        trust=args.trust,
-        conf_file=args.conf_file,
-    )
+    train.ExperimentManager = partial(ResumableExperiment, given=args)  # type: ignore[misc, assignment]
     return [] if seed is None else ["--seed", str(seed)]  # RL Zoo shows and stores it, and would draw one
 
 

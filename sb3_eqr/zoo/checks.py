@@ -7,15 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
-import gymnasium as gym
 import torch as th
 
-from sb3_eqr.common.checks.arguments import nearest
-from sb3_eqr.envs import import_packages
+from sb3_eqr.envs import check_registered, import_packages
 
 # Prefix of an environment's name -> package that it needs, and how to install it.
 EXTRAS = {"ALE/": ("ale_py", '".[atari]" in a clone of the repository'), "MinAtar/": ("minatar", "minatar")}
-SIMILAR = 0.8  # for names of environments: "-v0" alone makes any two alike
 
 
 def fail(message: str) -> NoReturn:
@@ -35,17 +32,13 @@ def failing(start: str = "", errors: tuple[type[Exception], ...] = (ValueError,)
 
 def check_environment(env_id: str, packages: list[str]) -> None:
     """Exit with a message if the environment is not registered after these packages are imported."""
-    with failing():
-        import_packages(packages)
     for start, (package, requirement) in EXTRAS.items():
         is_meant = env_id.startswith(start) or (start == "ALE/" and "NoFrameskip" in env_id)
         if is_meant and importlib.util.find_spec(package) is None:
             fail(f"--env: {env_id} needs {package}. Run pip install {requirement}.")
-    if env_id not in gym.registry:
-        fail(
-            f"--env: {env_id!r} is not registered with gymnasium.{nearest(env_id, gym.registry, SIMILAR)} "
-            "Environments of another package need --gym-packages PACKAGE."
-        )
+    with failing():
+        import_packages(packages)
+        check_registered(env_id, "--env")
 
 
 def check_device(device: str) -> None:

@@ -50,6 +50,17 @@ def number_in(value: Any, start: str = "") -> float:
         return np.nan
 
 
+def read_yaml(path: pathlib.Path) -> dict[str, Any]:
+    """Read a YAML file; raises ValueError if it is not valid, or not a mapping."""
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} must be valid YAML, got: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} must be a mapping, got {found!r:.60}.")
+    return found
+
+
 def read_file(path: str) -> dict[str, Any]:
     """
     :param path: a YAML file, or a Python file or package with a dictionary ``hyperparams``
@@ -64,11 +75,8 @@ def read_file(path: str) -> dict[str, Any]:
         fail(f"--conf-file: there is no file {path!r}.{nearest(path, configuration_files())}")
     if path.endswith(".py"):
         return runpy.run_path(path)["hyperparams"]
-    with failing(f"{path} must be valid YAML: ", (yaml.YAMLError,)):
-        entries = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8")) or {}
-    if not isinstance(entries, dict):
-        fail(f"{path} must be a mapping from environments to entries, got {entries!r:.60}.")
-    return entries
+    with failing():
+        return read_yaml(pathlib.Path(path))
 
 
 def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """Resumable runs of ``sb3-eqr train``: ``--checkpoint-every`` and ``--resume`` for RL Zoo's experiments."""
 
+import argparse
 import math
 import pathlib
 import shutil
@@ -42,26 +43,16 @@ class ResumableExperiment(ExperimentManager):
     """
     RL Zoo's experiment, which also writes checkpoints, or resumes from one into a new folder as with ``-i``.
 
-    :param checkpoint_every: steps between checkpoints; ``None``: no checkpoints
-    :param resume: a run's folder, or a folder of checkpoints; ``None``: a new run
-    :param trust: as in ``load``
-    :param conf_file: the file that the user named, which args.yml keeps; a temporary one may be used in its place
+    :param given: the arguments of ``sb3-eqr train``: ``checkpoint_every``, ``resume`` and ``trust``, which RL Zoo does not
+        have, and ``conf_file``, which args.yml keeps as the user named it; a temporary file may be used in its place
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        checkpoint_every: int | None,
-        resume: pathlib.Path | None,
-        trust: bool,
-        conf_file: str | None,
-        **kwargs: Any,
-    ):
+    def __init__(self, *args: Any, given: argparse.Namespace, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.args.conf_file = conf_file
-        self.checkpoint_every, self.resume, self.trust = checkpoint_every, resume, trust
+        self.args.conf_file = given.conf_file
+        self.checkpoint_every, self.resume, self.trust = given.checkpoint_every, given.resume, given.trust
         self.best: tuple[float, dict[str, Any]] = (-math.inf, {})  # value and parameters of a search's best trial
-        self.continue_training = self.continue_training or resume is not None
+        self.continue_training = self.continue_training or self.resume is not None
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """

@@ -46,11 +46,6 @@ def test_intervals_match_rliable():
     assert (np.random.get_state()[1] == state).all()
 
 
-def test_unequal_numbers_of_runs_raise():
-    with pytest.raises(ValueError, match="a must have the same number of runs on every game, got game0: 1, game1: 2"):
-        score_matrices(table("a", [[1.0, 2.0], [1.0, 2.0]]).query("game != 'game0' or seed == 0"))
-
-
 def test_the_detectable_difference_matches_resampled_experiments():
     """For one game, the IQM of n runs varies like the 25 %-trimmed mean of n samples."""
     rng = np.random.default_rng(1)

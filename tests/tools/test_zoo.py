@@ -114,7 +114,7 @@ ENTRY = "CartPole-v1: {policy: MlpPolicy, n_timesteps: 100, "
         ("CartPole-v1: {policy: MlpPolicy}", "the entry 'CartPole-v1' needs 'n_timesteps'"),
         ("CartPole-v1:", "the entry 'CartPole-v1' needs 'policy'"),
         ("CartPole-v1: {policy: [}", "must be valid YAML"),
-        ("", "no entry for 'CartPole-v1'"),
+        ("", "own.yml must be a mapping, got None"),
     ],
 )
 def test_invalid_files_print_an_error(sb3_eqr, tmp_path, text, message):
