@@ -27,7 +27,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
 from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, NETWORKS, OFF, Floor, Table, median, take_turns
-from sb3_eqr.common import eqr_algorithm
 from sb3_eqr.common.saving.files import atomic_write
 
 FLOOR, ONES = "floor", ", rounds of one"
@@ -152,7 +151,7 @@ def measure_parts(args: argparse.Namespace) -> Iterator[Table]:
                 "Adam": (model.policy.optimizer, "step"),
             }
             if name != "QRDQN":
-                parts |= {"losses": (model, "objective"), "backward": (eqr_algorithm, "assign_gradients")}
+                parts |= {"losses": (model, "objective"), "backward": (th.autograd, "backward")}
                 parts |= {"clip": (model, "_clip_gradients"), "target": (model.policy, "update_target")}
             with ExitStack() as patches:
                 timed = {part: Timed(getattr(*place)) for part, place in parts.items()}

@@ -72,9 +72,7 @@ def keep_constant_gradient(model: EqRRainbow) -> None:
     """Let the gradient of what all frames have in common reach the trunk, where the running mean removes the effect again."""
 
     def forward(layer: Centering, features: th.Tensor) -> th.Tensor:
-        if layer.training and th.is_grad_enabled():
-            mean = features.detach().mean(dim=0)
-            layer.note(mean, features.detach() - mean)
+        Centering.forward(layer, features)  # notes the batch
         return features - layer.running_mean
 
     for layer in model.policy.online.modules():

@@ -1,11 +1,10 @@
 """The algorithm of actor-critic agents with a latent model: before each update of SB3's, the latent model makes one."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
-import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -13,9 +12,8 @@ from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
-from sb3_eqr.common.networks.optimizers import assign_gradients
 from sb3_eqr.common.objective import LatentObjective, keep_freed_memory
-from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
@@ -40,6 +38,8 @@ class EqRActorCritic(EqROffPolicy):
     """
 
     policy: EqRActorCriticPolicy
+    rules = RULES
+    _check_action_space = staticmethod(validation.check_continuous_actions)
 
     def __init__(
         self,
@@ -69,23 +69,10 @@ class EqRActorCritic(EqROffPolicy):
         if _init_setup_model:
             self._setup_model()
 
-    @property
-    def loss_coefs(self) -> dict[str, float]:
-        """The weight λ of each auxiliary loss by its name."""
-        return {"aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
-
-    @classmethod
-    def _check_action_space(cls, action_space: spaces.Space) -> None:
-        validation.check_continuous_actions(action_space)
-
     def _check_arguments(self) -> None:
-        validation.check_has_env(self)
-        name, given = type(self).__name__, self.replay_buffer_kwargs
-        validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
-        check_arguments(vars(self), RULES)  # after the class, because a file may be another agent's
-        validation.check_normalization(self._vec_normalize_env, self.observation_space)
-        validation.check_replay(name, self.replay_buffer_class, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
+        super()._check_arguments()
         if issubclass(self.replay_buffer_class or SequenceReplayBuffer, PrioritizedSequenceReplayBuffer):
+            name = type(self).__name__
             raise ValueError(f"replay_buffer_class must sample uniformly, because {name} computes no priorities.")
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -116,15 +103,10 @@ class EqRActorCritic(EqROffPolicy):
         if self.policy.has_latent:
             policy = self.policy
             self.objective = LatentObjective(policy, policy.encoder, policy.latent_encoder, policy.augment)
-            self._trained = [p for group in policy.latent_optimizer.param_groups for p in group["params"]]
         keep_freed_memory()
 
     def _make_replay_buffer(self) -> SequenceReplayBuffer:
         return self._new_replay_buffer(self.replay_buffer_class or SequenceReplayBuffer, self.n_steps)
-
-    def _optimizers(self) -> list[th.optim.Optimizer]:
-        parts = [self.actor, self.critic]  # type: ignore[attr-defined]
-        return [part.optimizer for part in parts] + ([self.policy.latent_optimizer] if self.policy.has_latent else [])
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
@@ -144,33 +126,34 @@ class EqRActorCritic(EqROffPolicy):
             self._find_reward_scale(buffer, gradient_steps)
             update_learning_rate(policy.latent_optimizer, self.lr_schedule(self._current_progress_remaining))
             self.replay_buffer = BeforeSamples(buffer, self._update_latent_model, self.latent_batch_size or batch_size)  # type: ignore[assignment]
-        if policy.has_latent:
-            policy.reader.is_updating = True
-        try:
-            super().train(gradient_steps, batch_size)  # type: ignore[misc]
-        finally:
-            self.replay_buffer = buffer
-            if policy.has_latent:
-                policy.reader.is_updating = False
-                policy.reader.forget()
+        with policy.reader.updating() if policy.has_latent else nullcontext():
+            try:
+                super().train(gradient_steps, batch_size)  # type: ignore[misc]
+            finally:
+                self.replay_buffer = buffer
 
     def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:
         """One update of encoder and latent model, and of their moving averages."""
         policy, objective = self.policy, self.objective
-        assert samples.rollout_rewards is not None
         if policy.options.reward_loss == "mse":  # the other loss needs their signs
-            rewards = (samples.rollout_rewards - self.reward_mean) / self.reward_scale
-            samples = samples._replace(rollout_rewards=rewards.clamp(-MAX_REWARD, MAX_REWARD))
+            samples = self._standardized(samples)
         observations = objective.augment(samples.observations)
         features = policy.encoder(observations)
         names = [name for name, coef in self.loss_coefs.items() if coef > 0]
         losses = objective.latent_losses(names, samples, observations, features)
         means = {name: loss.mean() for name, loss in losses.items()}
-        assign_gradients(sum(self.loss_coefs[name] * mean for name, mean in means.items()), self._trained)  # type: ignore[arg-type]
+        policy.latent_optimizer.zero_grad()
+        sum(self.loss_coefs[name] * mean for name, mean in means.items()).backward()  # type: ignore[union-attr]
         policy.latent_optimizer.step()
         policy.target_copy.update(policy.options.latent_tau)  # type: ignore[arg-type]
         policy.reader.forget()
         self._monitor.add({f"{name}_loss": mean.detach() for name, mean in means.items()})
+
+    def _standardized(self, samples: SequenceReplayBufferSamples) -> SequenceReplayBufferSamples:
+        """The windows with rewards standardised, and clipped."""
+        assert samples.rollout_rewards is not None
+        rewards = (samples.rollout_rewards - self.reward_mean) / self.reward_scale
+        return samples._replace(rollout_rewards=rewards.clamp(-MAX_REWARD, MAX_REWARD))
 
     def _find_reward_scale(self, buffer: SequenceReplayBuffer, gradient_steps: int) -> None:
         """Estimate mean and standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
@@ -178,9 +161,6 @@ class EqRActorCritic(EqROffPolicy):
         is_due = -self._n_updates % SCALE_INTERVAL < gradient_steps or rewards.size < SCALE_INTERVAL
         if is_due and rewards.size >= MIN_REWARDS:
             self.reward_mean, self.reward_scale = moments(buffer._normalize_reward(rewards, self._vec_normalize_env))
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "objective", "_trained"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()

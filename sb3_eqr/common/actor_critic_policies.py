@@ -2,7 +2,8 @@
 
 import inspect
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -121,12 +122,12 @@ class LatentReader(BaseFeaturesExtractor):
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
         self._augment = augment
         self._plain = Augmentation(observation_space, augment._normalize_images, 0, 0.0)
-        self.is_updating = False  # during a round of updates
+        self._is_updating = False
         self._known: list[tuple[PyTorchObs, th.Tensor]] = []
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """Map observations as they come from the environment, (B, *obs_shape) or a dict of these, to (B, features_dim)."""
-        if not (self.is_updating and self.training):
+        if not (self._is_updating and self.training):
             return self._read(self._plain(observations))
         for seen, found in self._known:
             if seen is observations:
@@ -142,6 +143,16 @@ class LatentReader(BaseFeaturesExtractor):
         parts: list[Any] = [observations] if self.is_vector else []
         parts += [features] if self.reads_features else []
         return th.cat([*parts, latent_model.embedding(features)], dim=1)
+
+    @contextmanager
+    def updating(self) -> Iterator[None]:
+        """A context for a round of updates."""
+        self._is_updating = True
+        try:
+            yield
+        finally:
+            self._is_updating = False
+            self.forget()
 
     def forget(self) -> None:
         """Forget what was encoded, because the moving average has changed."""

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch as th
+from torch.utils._pytree import tree_map_only
 
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
@@ -59,7 +60,7 @@ class CapturedUpdate:
         key = self._key_of(samples)
         if key != self._key:
             self._key, self._calls, self._graph = key, 0, None
-            self._inputs = _copied(samples)
+            self._inputs = tree_map_only(th.Tensor, th.clone, samples)  # which the graph reads
             self._rates = [th.empty((), device=self._device) for _ in self._optimizer.param_groups]
         th._foreach_copy_(list(_tensors(self._inputs)), list(_tensors(samples)))
         for rate, group in zip(self._rates, self._optimizer.param_groups, strict=True):
@@ -141,14 +142,3 @@ def _tensors(samples: SequenceReplayBufferSamples) -> Iterator[th.Tensor]:
         for value in field.values() if isinstance(field, dict) else [field]:
             if isinstance(value, th.Tensor):
                 yield value
-
-
-def _copied(samples: SequenceReplayBufferSamples) -> SequenceReplayBufferSamples:
-    """A copy of the samples in separate tensors, which the graph reads."""
-    copies: dict[str, Any] = {}
-    for name, field in samples._asdict().items():
-        if isinstance(field, dict):
-            copies[name] = {key: value.clone() for key, value in field.items()}
-        elif isinstance(field, th.Tensor):
-            copies[name] = field.clone()
-    return samples._replace(**copies)

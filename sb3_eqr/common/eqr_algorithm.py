@@ -8,7 +8,6 @@ from typing import Any, Self
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule, get_device
@@ -17,9 +16,9 @@ from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedUpdate
-from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm, set_adam_defaults
+from sb3_eqr.common.networks.optimizers import clip_grad_norm, set_adam_defaults
 from sb3_eqr.common.objective import Objective, keep_freed_memory
-from sb3_eqr.common.off_policy import SET_BY_ALGORITHM, EqROffPolicy
+from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule
@@ -37,8 +36,6 @@ class EqRAlgorithm(EqROffPolicy):
     """
 
     policy: EqRPolicy
-    replay_buffer: SequenceReplayBuffer | None
-    replay_buffer_class: type[SequenceReplayBuffer] | None
     target_update_interval: int | None
     max_grad_norm: float | None
     exploration_schedule: Schedule
@@ -48,7 +45,7 @@ class EqRAlgorithm(EqROffPolicy):
     exploration_fraction: float
     _n_calls: int
     _create_aliases: Callable[[], None]  # from the SB3 algorithm: its own names of the networks
-    frame_stack = 1
+    _check_action_space = staticmethod(validation.check_action_space)
 
     @validation.answers_misspelt(policy_kwargs=EqRPolicy, replay_buffer_kwargs=PrioritizedSequenceReplayBuffer)
     def __init__(
@@ -205,6 +202,7 @@ class EqRAlgorithm(EqROffPolicy):
     def _setup_model(self) -> None:
         """As SB3's, but supports n-step replay of dicts and a target update per gradient step."""
         self._check_arguments()
+        self._check_losses()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is not None:
@@ -241,16 +239,6 @@ class EqRAlgorithm(EqROffPolicy):
         options = {name: getattr(self, name) for name in names}
         return {**options, "target_is_copied": self.tau == 1 and self.target_update_interval is None}
 
-    def _check_arguments(self) -> None:
-        check_arguments(vars(self), ALGORITHM)
-        validation.check_has_env(self)
-        name = type(self).__name__
-        validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
-        validation.check_normalization(self._vec_normalize_env, self.observation_space)
-        chosen, given = self.replay_buffer_class, self.replay_buffer_kwargs
-        validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
-        self._check_losses()
-
     def _check_losses(self) -> None:
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
@@ -277,7 +265,7 @@ class EqRAlgorithm(EqROffPolicy):
     @property
     def loss_coefs(self) -> dict[str, float]:
         """The weight λ of each loss by its name."""
-        return {"td": self.td_coef, "aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
+        return {"td": self.td_coef, **super().loss_coefs}
 
     def _make_policy(self) -> EqRPolicy:
         policy: Any = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
@@ -287,13 +275,6 @@ class EqRAlgorithm(EqROffPolicy):
         default = PrioritizedSequenceReplayBuffer if self.prioritized_replay else SequenceReplayBuffer
         longest = max(self.n_steps, self._resets.schedule.initial_n_steps or 0)  # the buffer must be able to hold it
         return self._new_replay_buffer(self.replay_buffer_class or default, longest)
-
-    @classmethod
-    def _check_action_space(cls, action_space: spaces.Space) -> None:
-        validation.check_action_space(action_space)
-
-    def _optimizers(self) -> list[th.optim.Optimizer]:
-        return [self.policy.optimizer]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
@@ -348,7 +329,8 @@ class EqRAlgorithm(EqROffPolicy):
         :return: new priorities of the samples, (B,), if the TD loss is used; metrics by name, () each
         """
         terms = self.objective(samples, self.loss_coefs)
-        assign_gradients(terms.loss, self._trained)
+        self.policy.optimizer.zero_grad()
+        terms.loss.backward()
         grad_norm = self._clip_gradients()
         self.policy.optimizer.step()
         self.policy.after_gradient_step()
@@ -424,12 +406,4 @@ class EqRAlgorithm(EqROffPolicy):
         return self
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_monitor",
-            "_trained",
-            "_clipped",
-            "_objective_options",
-            "objective",
-            "_captured",
-        ]
+        return [*super()._excluded_save_params(), "_clipped", "_objective_options", "_captured"]

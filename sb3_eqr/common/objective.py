@@ -1,14 +1,14 @@
 """The objective of one update (Eq. 21): computes the losses of samples. ``train`` of the agents applies them."""
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.latent.gradients import branch
-from sb3_eqr.common.latent.latent_model import LatentModel
 from sb3_eqr.common.networks.encoders import is_flat
 from sb3_eqr.common.networks.inputs import Augmentation
 from sb3_eqr.common.policies import EqRPolicy, ignores_mode
@@ -39,20 +39,6 @@ class LossTerms(NamedTuple):
         return metrics
 
 
-class HasLatentModel(Protocol):
-    """A policy with a latent model and its target copy."""
-
-    latent_model: LatentModel
-    latent_target: LatentModel
-
-    @property
-    def device(self) -> th.device:
-        """Where its parameters are."""
-
-    def embed_actions(self, actions: th.Tensor) -> th.Tensor:
-        """Action embeddings, (..., A), of actions."""
-
-
 class LatentObjective:
     """
     The auxiliary losses of windows.
@@ -66,7 +52,7 @@ class LatentObjective:
 
     def __init__(
         self,
-        policy: HasLatentModel,
+        policy: EqRPolicy | EqRActorCriticPolicy,
         encoder: nn.Module,
         latent_encoder: nn.Module,
         augment: Augmentation,
@@ -84,18 +70,18 @@ class LatentObjective:
         """The auxiliary losses along the rollout. The target encoder sees s_t with the online encoder's augmentation."""
         rollout, mask, rewards = samples.rollout_observations, samples.mask, samples.rollout_rewards
         assert rollout is not None and mask is not None and rewards is not None and samples.rollout_actions is not None
-        latent_model, target_features, target_rollout = self.policy.latent_model, None, None
+        target, target_state, target_states = self.policy.latent_target, None, None
         with th.no_grad():
-            if latent_model.NEED_FEATURES.intersection(names):
+            if "symmetry" in names:
                 is_same = self.latent_encoder is self.encoder
                 target_features = features if is_same else self.encode(self.latent_encoder, observations)
-            if latent_model.NEED_ROLLOUT.intersection(names):
+                target_state = target.embedding(target_features)  # x̄₀, (B, D)
+            if "aet" in names:
                 augmented = self.augment(flat(rollout), self.target_dtype)
-                target_rollout = self.encode(self.latent_encoder, augmented)  # (B * M, F)
+                target_states = target.embedding(self.encode(self.latent_encoder, augmented))  # x̄_1 ... x̄_M, (B * M, D)
         # After the end of an episode, action 0: what follows must not leak through batch statistics.
         embedded = self.policy.embed_actions(valid_actions(samples.rollout_actions, mask))  # (B, M, A)
-        target = self.policy.latent_target
-        return latent_model(names, features, embedded, rewards, mask, target, target_features, target_rollout)
+        return self.policy.latent_model(names, features, embedded, rewards, mask, target, target_state, target_states)
 
     def encode(self, encoder: nn.Module, observations: PyTorchObs) -> th.Tensor:
         """Features without gradient, (B, F), of augmented observations, (B, *obs_shape)."""

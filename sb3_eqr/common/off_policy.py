@@ -3,7 +3,7 @@
 import copy
 import inspect
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch as th
@@ -11,12 +11,13 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_normalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import check, nearest, number
+from sb3_eqr.common.checks.arguments import ALGORITHM, Rule, check, check_arguments, nearest, number
 from sb3_eqr.common.checks.finite_data import FiniteData
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
@@ -31,6 +32,8 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     policy: Any
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    rules: ClassVar[Mapping[str, Rule]] = ALGORITHM  # the legal values of attributes
+    _check_action_space: ClassVar[Callable[..., None]]  # raises AssertionError, as SB3 does
     replay_buffer: SequenceReplayBuffer | None
     replay_buffer_class: type[SequenceReplayBuffer] | None
     prediction_depth: int
@@ -44,9 +47,9 @@ class EqROffPolicy(FiniteData, SafeFiles):
     _monitor: UpdateMonitor
 
     @property
-    def loss_coefs(self) -> Mapping[str, float]:
+    def loss_coefs(self) -> dict[str, float]:
         """The weight λ of each loss by its name."""
-        raise NotImplementedError
+        return {"aet": self.aet_coef, "symmetry": self.symmetry_coef, "reward": self.reward_coef}
 
     @property
     def depth(self) -> int:
@@ -54,12 +57,24 @@ class EqROffPolicy(FiniteData, SafeFiles):
         is_used = any(coef for name, coef in self.loss_coefs.items() if name != "td")
         return self.prediction_depth if is_used else 0
 
-    @classmethod
-    def _check_action_space(cls, action_space: spaces.Space) -> None:
-        """Raise AssertionError, as SB3 does, for an action space that the algorithm does not support."""
+    def _convert_train_freq(self) -> None:
+        given = self.train_freq
+        if not isinstance(given, TrainFreq):  # SB3 accepts neither lists nor NumPy's integers
+            frequency, unit = given if isinstance(given, (tuple, list)) else (given, "step")
+            self.train_freq = int(frequency), unit
+        super()._convert_train_freq()  # type: ignore[misc]
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        raise NotImplementedError
+        saved = [recursive_getattr(self, name) for name in self._get_torch_save_params()[0]]
+        return [part for part in saved if isinstance(part, th.optim.Optimizer)]
+
+    def _check_arguments(self) -> None:
+        validation.check_has_env(self)
+        name, chosen, given = type(self).__name__, self.replay_buffer_class, self.replay_buffer_kwargs
+        validation.check_policy(name, self.policy_class, self.policy_aliases, self.observation_space)
+        check_arguments(vars(self), self.rules)  # after the class, because a file may be another agent's
+        validation.check_normalization(self._vec_normalize_env, self.observation_space)
+        validation.check_replay(name, chosen, SequenceReplayBuffer, given, SET_BY_ALGORITHM)
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -168,6 +183,9 @@ class EqROffPolicy(FiniteData, SafeFiles):
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)  # type: ignore[misc]
         # The last rollout may exceed the total number of steps, where a linear schedule would give a negative learning rate.
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "objective"]
 
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite

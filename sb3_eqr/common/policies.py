@@ -170,26 +170,20 @@ class EqRPolicy(BasePolicy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Create the trunk, with the group encoder on top of it if the Q head takes group elements."""
-        trunk_kwargs = with_image_scale(self.features_extractor_class, self.features_extractor_kwargs, self.normalize_images)
-        is_encoder = issubclass(self.features_extractor_class, GroupFeaturesExtractor)
-        if is_encoder and self.options.group is not None and self.head_input == "trunk":
+        kind, space, has_group = self.features_extractor_class, self.observation_space, self.options.group is not None
+        is_encoder = issubclass(kind, GroupFeaturesExtractor)
+        if is_encoder and has_group and self.head_input == "trunk":
             raise ValueError(
                 'features_extractor_class must be a trunk if head_input="trunk", got a group encoder. Pass head_input="state".'
             )
-        if self.options.group is None or self.head_input == "trunk":
-            return make_trunk(
-                self.features_extractor_class, self.observation_space, trunk_kwargs, self.layer_norm, self.center
-            )
-        group_kwargs = {name: getattr(self, name) for name in ("layer_norm", "center")} | self._group_kwargs
+        kwargs = with_image_scale(kind, self.features_extractor_kwargs, self.normalize_images)
+        if not has_group or self.head_input == "trunk":
+            return make_trunk(kind, space, kwargs, self.layer_norm, self.center)
+        group_kwargs = {**self._group_kwargs, "layer_norm": self.layer_norm, "center": self.center}
         group_kwargs["normalized_image"] = not self.normalize_images
         if is_encoder:
-            return self.features_extractor_class(self.observation_space, **{**group_kwargs, **trunk_kwargs})
-        return GroupFeaturesExtractor(
-            self.observation_space,
-            **group_kwargs,  # type: ignore[arg-type]
-            trunk_class=self.features_extractor_class,
-            trunk_kwargs=trunk_kwargs,
-        )
+            return kind(space, **{**group_kwargs, **kwargs})
+        return GroupFeaturesExtractor(space, **group_kwargs, trunk_class=kind, trunk_kwargs=kwargs)
 
     @property
     def _group_kwargs(self) -> dict[str, Any]:
@@ -325,10 +319,15 @@ class EqRPolicy(BasePolicy):
         """Put all trained modules into train or eval mode; the target copies stay in eval mode."""
         if mode == self.training:
             return  # SB3 calls this at every environment step, and visiting all modules is slow
-        super().set_training_mode(mode)
-        self.latent_model.train(mode)
-        for module in self._frozen:
-            module.eval()
+        self.train(mode)
+
+    def train(self, mode: bool = True) -> "EqRPolicy":
+        """As PyTorch's, but target copies and frozen modules stay in eval mode."""
+        super().train(mode)
+        for module in (self.target, self.latent_target, self.latent_encoder, *self._frozen):
+            if module is not None:
+                module.eval()
+        return self
 
     def freeze(self, modules: list[nn.Module]) -> None:
         """Freeze the parameters and batch statistics of these modules, and unfreeze all others."""

@@ -18,13 +18,9 @@ from sb3_eqr.common.policies import EqRPolicy
 class EqRQuantileNetwork(EqRNetwork, QuantileNetwork):
     """Features extractor and quantile head. See :class:`~sb3_eqr.common.networks.q_networks.EqRNetwork` for the parameters."""
 
-    def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
-        """
-        :param obs: (B, *obs_shape), or a dict of these
-        :param noisy: whether to draw noise in noisy layers
-        :return: quantiles, (B, n_quantiles, n_actions)
-        """
-        return self.head(self.features(obs), self.head.draw_noise() if noisy else None)
+    def forward(self, obs: PyTorchObs) -> th.Tensor:
+        """Quantiles, (B, n_quantiles, n_actions), of observations, (B, *obs_shape) or a dict of these, without noise."""
+        return self.head(self.features(obs))
 
     @property
     def n_quantiles(self) -> int:  # type: ignore[override]

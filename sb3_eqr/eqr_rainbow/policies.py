@@ -32,13 +32,9 @@ class EqRCategoricalNetwork(EqRNetwork, QNetwork):
         self.v_max = v_max
         self.register_buffer("support", th.linspace(v_min, v_max, self.head.n_atoms), persistent=False)
 
-    def forward(self, obs: PyTorchObs, noisy: bool = False) -> th.Tensor:
-        """
-        :param obs: (B, *obs_shape), or a dict of these
-        :param noisy: whether to draw noise in noisy layers
-        :return: Q values, (B, n_actions)
-        """
-        return self.expectation(self.head(self.features(obs), self.head.draw_noise() if noisy else None))
+    def forward(self, obs: PyTorchObs) -> th.Tensor:
+        """Q values, (B, n_actions), of observations, (B, *obs_shape) or a dict of these, without noise."""
+        return self.expectation(self.head(self.features(obs)))
 
     def expectation(self, outputs: th.Tensor) -> th.Tensor:
         support = self.support.view(-1, *[1] * (outputs.ndim - 2))  # (N, 1) or (N,)

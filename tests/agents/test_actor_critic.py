@@ -375,6 +375,17 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
 
 
 @EACH
+def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
+    make(agent, ent_coef=0.1).learn(30, callback=ExactCheckpointCallback(20, tmp_path))
+    for other, why in (
+        ({"ent_coef": 0.2}, "ent_coef = 0.1 there, 0.2"),
+        ({"latent_batch_size": 4}, "latent_batch_size = None there, 4"),
+    ):
+        with pytest.raises(ValueError, match=f"must be empty or hold checkpoints of this run, .*{why} here"):
+            make(agent, **{"ent_coef": 0.1, **other}).learn(30, callback=ExactCheckpointCallback(20, tmp_path))
+
+
+@EACH
 @pytest.mark.parametrize(
     "kwargs, message",
     [

@@ -137,6 +137,14 @@ def test_ranges_by_hand():
         assert not [name for name, value in values.items() if PLACES[place][name].holds(value)]
 
 
+@pytest.mark.parametrize(
+    "given, wanted", [([2, "step"], (2, "step")), (np.int64(3), (3, "step")), ((1, "episode"), (1, "episode"))]
+)
+def test_lists_and_numpys_integers_are_frequencies(given, wanted):
+    found = EqRQRDQN("MlpPolicy", "CartPole-v1", train_freq=given, gradient_steps=1).train_freq
+    assert (found.frequency, found.unit.value) == wanted and type(found.frequency) is int
+
+
 def test_rules_by_hand():
     assert number(0, 1).holds(1) and not number(0, 1).holds(1.1) and not number(0, above=True).holds(0)
     assert integer(1).holds(np.int64(1)) and not integer(1).holds(1.0) and not integer(0).holds(True)

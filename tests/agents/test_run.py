@@ -3,6 +3,7 @@
 import re
 from contextlib import nullcontext
 from copy import deepcopy
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -279,8 +280,9 @@ def test_batch_norm_statistics_change_in_training_only(make):
 
 def test_train_mode_applies_to_the_trained_networks_only(make):
     policy = make(ChainEnv()).policy
-    for mode in (True, False):
-        policy.set_training_mode(mode)
+    for mode, put in product((True, False), (policy.train, policy.set_training_mode)):
+        policy.train(not mode)
+        put(mode)
         assert policy.training == mode and policy.online.training == mode
         assert all(module.training == mode for module in policy.latent_model.modules())
         assert not any(m.training for m in [*policy.target.modules(), *policy.latent_target.modules()])

@@ -107,8 +107,8 @@ def inputs_of_the_latent_model(model, samples, monkeypatch):
 
 
 @pytest.mark.parametrize("network", [PAPER, {}, {"latent_tau": 0.25}], ids=["paper", "default", "slow latent target"])
-def test_target_features_reach_the_latent_model_in_order(make, monkeypatch, network):
-    """The online and target features of s_t, s_{t+1} ... s_{t+M}, each in the right place."""
+def test_target_states_reach_the_latent_model_in_order(make, monkeypatch, network):
+    """The online features of s_t, and the target's states of s_t, s_{t+1} ... s_{t+M}, each in the right place."""
     model = trained_model(make, policy_kwargs=network)
     samples, policy = model.replay_buffer.sample(8), model.policy
     seen = inputs_of_the_latent_model(model, samples, monkeypatch)
@@ -121,21 +121,21 @@ def test_target_features_reach_the_latent_model_in_order(make, monkeypatch, netw
     hot = th.nn.functional.one_hot(samples.rollout_actions * samples.mask.long(), 3).float()
     assert th.equal(seen["actions"], hot) and seen["target"] is policy.latent_target
     assert seen["rewards"] is samples.rollout_rewards and seen["mask"] is samples.mask
-    rollout = seen["target_rollout"].view(8, 2, -1)
-    assert not rollout.requires_grad
-    th.testing.assert_close(seen["target_features"].detach(), encoder(samples.observations).detach())
+    rollout, embedding = seen["target_states"].view(8, 2, -1), policy.latent_target.embedding
+    assert not rollout.requires_grad and not seen["target_state"].requires_grad
+    th.testing.assert_close(seen["target_state"], embedding(encoder(samples.observations)).detach())
     for m in range(2):
-        th.testing.assert_close(rollout[:, m], encoder(samples.rollout_observations[:, m]).detach())
+        th.testing.assert_close(rollout[:, m], embedding(encoder(samples.rollout_observations[:, m])).detach())
 
 
 @EITHER
 def test_the_target_encodes_the_same_augmented_image(make, monkeypatch):
-    """A target that equals the online encoder gives the same features, although both are computed."""
+    """A target that equals the online encoder gives the same states, although both are computed."""
     model = make(ImageEnv(), "CnnPolicy", policy_kwargs={"latent_tau": 0.25}).learn(44)
     model.policy.latent_target_copy.update(1.0)
     seen = inputs_of_the_latent_model(model, model.replay_buffer.sample(8), monkeypatch)
-    assert seen["target_features"] is not seen["features"]
-    th.testing.assert_close(seen["target_features"], seen["features"].detach())
+    assert model.policy.latent_encoder is not model.policy.online.features_extractor
+    th.testing.assert_close(seen["target_state"], model.policy.latent_model.embedding(seen["features"]).detach())
 
 
 def test_an_update_sees_normalised_observations_and_rewards(make, monkeypatch):

@@ -1,46 +1,17 @@
-"""Where gradients meet, compared with autograd; assigning and clipping them, compared with PyTorch's functions."""
+"""Where gradients meet, compared with autograd; clipping them, compared with PyTorch's function."""
 
 import pytest
 import torch as th
 from torch import nn
 
 from sb3_eqr.common.latent.gradients import branch
-from sb3_eqr.common.networks.optimizers import assign_gradients, clip_grad_norm
+from sb3_eqr.common.networks.optimizers import clip_grad_norm
 
 
 def same(found, expected):
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
         th.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
-
-
-def test_assigned_gradients_equal_those_of_backward():
-    th.manual_seed(0)
-    network, frozen, unused = nn.Linear(3, 2), nn.Linear(2, 1).requires_grad_(False), nn.Linear(2, 2)
-    parameters = [*network.parameters(), *frozen.parameters(), *unused.parameters()]
-    inputs = th.randn(4, 3)
-    for parameter in parameters:
-        parameter.grad = th.ones_like(parameter)  # from an earlier update
-    assign_gradients(frozen(network(inputs)).square().sum(), parameters)
-    found = [parameter.grad for parameter in parameters]
-    for parameter in parameters:
-        parameter.grad = None
-    frozen(network(inputs)).square().sum().backward()
-    for gradient, parameter in zip(found, parameters, strict=True):
-        assert (gradient is None) == (parameter.grad is None) and (gradient is None or th.equal(gradient, parameter.grad))
-
-
-def test_gradients_have_the_strides_of_their_parameters():
-    """A fused optimiser reads a parameter and its gradient in the order of memory, whatever their strides."""
-    th.manual_seed(0)
-    network = nn.Sequential(nn.Conv2d(2, 3, 3), nn.ReLU(), nn.Conv2d(3, 4, 2))
-    images = th.randn(5, 2, 6, 6).contiguous(memory_format=th.channels_last)
-    parameters = list(network.parameters())
-    raw = th.autograd.grad(network(images).square().sum(), parameters)
-    assert any(a.stride() != b.stride() for a, b in zip(raw, parameters, strict=True)), "nothing is tested"
-    assign_gradients(network(images).square().sum(), parameters)
-    assert [p.grad.stride() for p in parameters] == [p.stride() for p in parameters]
-    same([p.grad for p in parameters], raw)
 
 
 @pytest.mark.parametrize("max_norm", [None, 0.1, 100.0])

@@ -98,15 +98,16 @@ def random_case(group="SE(2)", n_blocks=3, batch=6, depth=4, seed=0, **options):
     model, target = (make_model(group, n_blocks, 5, e, latent_hidden_dim=16, **options).double() for e in embeddings)
     with th.no_grad():
         model.predictor.weight.add_(0.3 * th.randn_like(model.predictor.weight))
+    target = frozen_copy(target)
     case = {
         "names": LOSSES,
         "features": th.randn(batch, 7, dtype=th.float64),
         "actions": F.one_hot(th.randint(5, (batch, depth)), 5).double(),
         "rewards": th.randn(batch, depth, dtype=th.float64),
         "mask": th.ones(batch, depth, dtype=th.float64),
-        "target": frozen_copy(target),
-        "target_features": th.randn(batch, 7, dtype=th.float64),
-        "target_rollout": th.randn(batch * depth, 7, dtype=th.float64),
+        "target": target,
+        "target_state": target.embedding(th.randn(batch, 7, dtype=th.float64)),
+        "target_states": target.embedding(th.randn(batch * depth, 7, dtype=th.float64)),
     }
     return model, case
 
@@ -149,13 +150,13 @@ def test_against_loops_over_samples_and_blocks():
             moved = [k @ b for k, b in zip(elements(model.transition, x, action), blocks(x), strict=True)]
             x = entries(moved)
             predictions.append(x)
-            truth = run(target.embedding, case["target_rollout"][4 * i + m])
+            truth = case["target_states"][4 * i + m].numpy()
             aet += distance(run(model.predictor, run(model.projection, x)), run(target.projection, truth))
             reward += (run(model.reward_net, x)[0] - case["rewards"][i, m].item()) ** 2
         assert losses["aet"][i].item() == pytest.approx(aet / 4, rel=1e-10)
         assert losses["reward"][i].item() == pytest.approx(reward / 4, rel=1e-10)
 
-        partner = run(target.embedding, case["target_features"][partners[i]])
+        partner = case["target_state"][partners[i]].numpy()
         symmetry = [p @ np.linalg.inv(s) for p, s in zip(blocks(partner), blocks(start), strict=True)]
         left = entries([g @ b for g, b in zip(symmetry, blocks(predictions[0]), strict=True)])
         rho = elements(model.action_symmetry, entries(symmetry))
@@ -179,10 +180,10 @@ def test_masked_steps_have_no_influence(options):
         sum(loss.sum() for loss in losses.values()).backward()
         return [*losses.values(), case["features"].grad.clone(), *(p.grad.clone() for p in model.parameters())]
 
-    rewards, actions, targets = case["rewards"].clone(), case["actions"].clone(), case["target_rollout"].clone()
+    rewards, actions, targets = case["rewards"].clone(), case["actions"].clone(), case["target_states"].clone()
     hidden = case["mask"] == 0
     rewards[hidden], actions[hidden], targets[hidden.flatten()] = -77.0, 5.0, 123.0
-    before, after = run(), run(rewards=rewards, actions=actions, target_rollout=targets)
+    before, after = run(), run(rewards=rewards, actions=actions, target_states=targets)
     for a, b in zip(before, after, strict=True):
         th.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 
@@ -203,7 +204,7 @@ def test_an_unusual_state_changes_the_others_with_batch_norm_only(norm):
 def test_each_loss_trains_its_networks_only():
     model, case = random_case()
     target = case["target"].requires_grad_()  # in an agent it is frozen; here it shows where gradients would go
-    inputs = {name: case[name].requires_grad_() for name in ("features", "target_features", "target_rollout")}
+    inputs = {name: case[name].requires_grad_() for name in ("features", "target_state", "target_states")}
     inputs |= dict(model.named_parameters()) | {f"target {name}": p for name, p in target.named_parameters()}
     losses = model(**case)
 

@@ -3,7 +3,6 @@
 import zlib
 from collections.abc import Callable, Sequence
 from functools import cache
-from weakref import WeakKeyDictionary
 
 import torch as th
 from torch.nn import functional as F
@@ -199,6 +198,10 @@ class _Rotations(MatrixGroup):
         self.n = n
         self.parameterization = parameterization
 
+    @property
+    def for_actions(self) -> Group:
+        return type(self)(self.n) if self.parameterization == "gram-schmidt" else self  # type: ignore[call-arg, arg-type]
+
 
 class SO(_Rotations):
     """Special orthogonal: rotations in n dimensions, n ≥ 2."""
@@ -211,10 +214,6 @@ class SO(_Rotations):
 
     def inverse(self, element: th.Tensor) -> th.Tensor:
         return element.mT
-
-    @property
-    def for_actions(self) -> Group:
-        return SO(self.n) if self.parameterization == "gram-schmidt" else self
 
 
 class SE(_Rotations):
@@ -233,10 +232,6 @@ class SE(_Rotations):
     def inverse(self, element: th.Tensor) -> th.Tensor:
         rotation_inverse = element[..., :-1].mT
         return th.cat([rotation_inverse, -rotation_inverse @ element[..., -1:]], dim=-1)
-
-    @property
-    def for_actions(self) -> Group:
-        return SE(self.n) if self.parameterization == "gram-schmidt" else self
 
 
 class T(Group):
@@ -312,18 +307,5 @@ class MatrixLieGroup(MatrixGroup):
         super().__init__(f"MatrixLieGroup({d}x{m}x{m}, {checksum:08x})", d, m, is_affine)
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        generators = _placed(self, params.dtype, params.device)
-        matrix = th.matrix_exp(th.einsum("...d,dij->...ij", params, generators))
+        matrix = th.matrix_exp(th.einsum("...d,dij->...ij", params, self.generators.to(params)))
         return matrix[..., : self.element_shape[0], :]
-
-
-_PLACED: WeakKeyDictionary[MatrixLieGroup, dict[tuple[th.dtype, th.device], th.Tensor]] = WeakKeyDictionary()
-
-
-def _placed(group: MatrixLieGroup, dtype: th.dtype, device: th.device) -> th.Tensor:
-    """The generators, copied once per device instead of once per step, and not saved with the group."""
-    copies = _PLACED.setdefault(group, {})
-    if (dtype, device) not in copies:
-        with th.inference_mode(False):  # as in _bottom_row
-            copies[dtype, device] = group.generators.to(dtype=dtype, device=device)
-    return copies[dtype, device]

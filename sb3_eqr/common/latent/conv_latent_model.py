@@ -42,11 +42,8 @@ class ConvLatentModel(LatentModel):
             nn.ReLU(),
         )
 
-    def rollout(self, state: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Predict x̂_1 ... x̂_M, (B, M, C * H * W), from x₀, (B, C * H * W), and action embeddings, (B, M, A)."""
-        planes = actions[..., None, None].expand(-1, -1, -1, *self.map_shape[1:])  # (B, M, A, H, W)
-        states = [state]
-        for plane in planes.unbind(1):
-            moved = self.transition(th.cat([states[-1].view(-1, *self.map_shape), plane], dim=1))
-            states.append(rescaled(moved.flatten(1)))
-        return th.stack(states[1:], dim=1)
+    def action_element(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:
+        """The next state, (B, 1, D), of states, (B, D), and action embeddings, (B, A): without a group, it is κ(x, a)."""
+        planes = action[..., None, None].expand(-1, -1, *self.map_shape[1:])  # (B, A, H, W)
+        moved = self.transition(th.cat([state.view(-1, *self.map_shape), planes], dim=1))
+        return rescaled(moved.flatten(1))[:, None]

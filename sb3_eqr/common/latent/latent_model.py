@@ -45,9 +45,6 @@ class LatentModel(nn.Module):
     :param projection: p of the AET loss if ``options.projection`` is "head": a module from (N, D) to (N, P)
     """
 
-    NEED_FEATURES = frozenset({"symmetry"})  # losses that compare with the target's state of s_t,
-    NEED_ROLLOUT = frozenset({"aet"})  # and with those of s_{t+1} ... s_{t+M}
-
     def __init__(
         self,
         embedding: nn.Module,
@@ -107,8 +104,8 @@ class LatentModel(nn.Module):
         rewards: th.Tensor,
         mask: th.Tensor,
         target: "LatentModel",
-        target_features: th.Tensor | None = None,
-        target_rollout: th.Tensor | None = None,
+        target_state: th.Tensor | None = None,
+        target_states: th.Tensor | None = None,
     ) -> dict[str, th.Tensor]:
         """
         Compute the auxiliary losses of Eq. 18 and 19, per sample. AET and reward loss are means over the valid steps of the
@@ -120,19 +117,19 @@ class LatentModel(nn.Module):
         :param rewards: r_{t+1} ... r_{t+M}, (B, M)
         :param mask: 1 where the episode had not ended before step t+m, (B, M); the step that ends it counts
         :param target: the target copy of this model
-        :param target_features: of s_t from the target encoder, (B, F), for the losses in ``NEED_FEATURES``
-        :param target_rollout: of s_{t+1} ... s_{t+M} from the target encoder, (B * M, F), for those in ``NEED_ROLLOUT``
+        :param target_state: x̄₀, the target's latent state of s_t, (B, D), which "symmetry" needs
+        :param target_states: x̄_1 ... x̄_M, those of s_{t+1} ... s_{t+M}, (B * M, D), which "aet" needs
         :return: (B,) for each name
         """
         state = self.embedding(features)  # x₀ = τ(s_t), (B, D)
         predicted = self.rollout(state, actions)  # x̂_1 ... x̂_M, (B, M, D)
         losses = {}
         if "aet" in names:
-            assert target_rollout is not None
-            losses["aet"] = self.aet_loss(predicted, target_rollout, mask, target)
+            assert target_states is not None
+            losses["aet"] = self.aet_loss(predicted, target_states, mask, target)
         if "symmetry" in names:
-            assert target_features is not None
-            found = self.symmetry_loss(state, predicted[:, 0], actions[:, 0], target_features, target)
+            assert target_state is not None
+            found = self.symmetry_loss(state, predicted[:, 0], actions[:, 0], target_state, target)
             losses["symmetry"] = mask[:, 0] * found
         if "reward" in names:
             losses["reward"] = self.reward_loss(predicted, rewards, mask)
@@ -152,7 +149,7 @@ class LatentModel(nn.Module):
             states.append(state)
         return th.stack(states, dim=1)
 
-    def aet_loss(self, predicted: th.Tensor, target_rollout: th.Tensor, mask: th.Tensor, target: "LatentModel") -> th.Tensor:
+    def aet_loss(self, predicted: th.Tensor, target_states: th.Tensor, mask: th.Tensor, target: "LatentModel") -> th.Tensor:
         """
         Action-equivariant transitions (Eq. 18): the mean over valid m of d(p(x̂_m), p̄(x̄_m)), with the predictor after p, and
         d(u, v) = ‖u/‖u‖ − v/‖v‖‖² or, with ``aet_loss="contrastive"``, InfoNCE (both in ``losses.py``).
@@ -160,7 +157,7 @@ class LatentModel(nn.Module):
         :return: (B,)
         """
         with th.no_grad():
-            wanted = target.projection(target.embedding(target_rollout))  # (B * M, P)
+            wanted = target.projection(target_states)  # (B * M, P)
         found = self.project(predicted.flatten(0, 1))
         losses = AET_LOSSES[self.options.aet_loss](found.view(*mask.shape, -1), wanted.view(*mask.shape, -1), mask)
         return mean_over_steps(losses, mask)
@@ -178,7 +175,7 @@ class LatentModel(nn.Module):
         state: th.Tensor,
         predicted: th.Tensor,
         action: th.Tensor,
-        target_features: th.Tensor,
+        target_state: th.Tensor,
         target: "LatentModel",
     ) -> th.Tensor:
         """
@@ -190,7 +187,7 @@ class LatentModel(nn.Module):
         # As in the authors' code, τ_g carries no gradient, nor does what comes from the target: on the right, only ρ learns.
         with th.no_grad():
             partners = th.randint(len(state), (len(state),), device=state.device)
-            partner = target.embedding(target_features)[partners]  # x̄_j of Algorithm 1, (B, D)
+            partner = target_state[partners]  # x̄_j of Algorithm 1, (B, D)
             symmetry = self.group.compose(self.blocks(partner), self.group.inverse(self.blocks(state)))  # τ_g
             next_partner = target.act(target.action_element(state, action), partner)  # κ̄ · x̄_j, (B, D)
         rho = self.element(self.action_symmetry(symmetry.flatten(1)))  # ρ(τ_g)

@@ -200,41 +200,34 @@ class MlpExtractor(BaseFeaturesExtractor):
     features.
 
     :param observation_space: any space except ``Dict``
-    :param features_dim: size of the layer
+    :param features_dim: size of every layer
     """
 
     def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
         check("features_dim", features_dim, integer(1))
         super().__init__(observation_space, features_dim)
         flat = FlattenExtractor(observation_space)
-        self.layers = nn.Sequential(flat, nn.Linear(flat.features_dim, features_dim), nn.ReLU())
+        self.layers = nn.Sequential(flat, *self.make_layers(flat.features_dim, features_dim))
+
+    @staticmethod
+    def make_layers(n_in: int, n_out: int) -> list[nn.Module]:
+        """The layers after flattening."""
+        return [nn.Linear(n_in, n_out), nn.ReLU()]
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Map (B, *obs_shape) to (B, features_dim)."""
         return self.layers(observations)
 
 
-class TwoLayerExtractor(BaseFeaturesExtractor):
-    """
-    Flatten, a linear layer, layer norm, ELU and a second linear layer: an encoder for vectors.
+class TwoLayerExtractor(MlpExtractor):
+    """Flatten, a linear layer, layer norm, ELU and a second linear layer: an encoder for vectors. Same parameters."""
 
-    :param observation_space: any space except ``Dict``
-    :param features_dim: size of both layers
-    """
-
-    def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
-        check("features_dim", features_dim, integer(1))
-        super().__init__(observation_space, features_dim)
-        flat = FlattenExtractor(observation_space)
-        first, second = nn.Linear(flat.features_dim, features_dim), nn.Linear(features_dim, features_dim)
-        self.layers = nn.Sequential(flat, first, nn.LayerNorm(features_dim), nn.ELU(), second)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Map (B, *obs_shape) to (B, features_dim)."""
-        return self.layers(observations)
+    @staticmethod
+    def make_layers(n_in: int, n_out: int) -> list[nn.Module]:
+        return [nn.Linear(n_in, n_out), nn.LayerNorm(n_out), nn.ELU(), nn.Linear(n_out, n_out)]
 
 
-FLAT = (MlpExtractor, TwoLayerExtractor, FlattenExtractor)  # for vectors
+FLAT = (MlpExtractor, FlattenExtractor)  # for vectors
 
 
 class DictExtractor(BaseFeaturesExtractor):
@@ -416,11 +409,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
         features_dim: int | None = None,
     ):
         super().__init__(observation_space, 1)  # the size is set below
-        trunk_kwargs = dict(trunk_kwargs or {})
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
-        is_default = trunk_class is None and found is not FlattenExtractor
-        if is_default or (normalized_image and issubclass(found, (ImageExtractor, DictExtractor))):
-            trunk_kwargs.setdefault("normalized_image", normalized_image)
+        trunk_kwargs = with_image_scale(found, trunk_kwargs or {}, not normalized_image)
         if features_dim is not None:
             trunk_kwargs["features_dim"] = features_dim
         self.trunk = make_trunk(found, observation_space, trunk_kwargs, layer_norm, center)

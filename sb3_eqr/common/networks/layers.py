@@ -84,11 +84,6 @@ def draw_noise(layers: Sequence[NoisyLinear]) -> list[Noise]:
     return list(map(Noise, pieces[::2], pieces[1::2]))
 
 
-def make_linear(n_in: int, n_out: int, sigma_init: float | None) -> nn.Linear | NoisyLinear:
-    """A noisy linear layer, or a plain one if ``sigma_init`` is ``None``."""
-    return nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
-
-
 class MLP(nn.Sequential):
     """
     Linear layers with activations between them.
@@ -101,7 +96,8 @@ class MLP(nn.Sequential):
     def __init__(self, sizes: list[int], activation_fn: type[nn.Module], sigma_init: float | None):
         modules: list[nn.Module] = []
         for n_in, n_out in pairwise(sizes):
-            modules += [make_linear(n_in, n_out, sigma_init), activation_fn()]
+            linear = nn.Linear(n_in, n_out) if sigma_init is None else NoisyLinear(n_in, n_out, sigma_init)
+            modules += [linear, activation_fn()]
         super().__init__(*modules[:-1])
 
     def forward(self, inputs: th.Tensor, noise: Iterator[Noise | NoisyWeights] | None = None) -> th.Tensor:
@@ -231,21 +227,13 @@ class Centering(nn.Module):
         """
         if self.training and th.is_grad_enabled() and len(features) > 1:
             mean = features.mean(dim=0)
-            self.note(mean.detach(), features.detach() - mean.detach())
+            deviations = features.detach() - mean.detach()
+            self.batch_mean.copy_(mean.detach())  # th.var_mean takes 10 to 20 times as long as this along the first dimension
+            self.batch_error.copy_(deviations.square().sum() / ((len(features) - 1) * len(features)))
             features = features - (mean - mean.detach())  # subtracts 0; the gradient loses its mean
         elif self.training and th.is_grad_enabled():
             self.batch_mean.copy_(self.running_mean)  # update then moves nothing
         return features - self.running_mean
-
-    def note(self, mean: th.Tensor, deviations: th.Tensor) -> None:
-        """
-        Note the mean of a batch for :meth:`update`.
-
-        :param mean: (D,) without gradient
-        :param deviations: (B, D) from it, without gradient, B ≥ 2
-        """
-        self.batch_mean.copy_(mean)  # th.var_mean takes 10 to 20 times as long as this along the first dimension
-        self.batch_error.copy_(deviations.square().sum() / ((len(deviations) - 1) * len(deviations)))
 
     def update(self) -> None:
         """Called after each gradient step; without effect in eval mode."""

@@ -1,4 +1,4 @@
-"""Optimisers: lookup by name, defaults and weight decay; assigning and clipping gradients with few operations."""
+"""Optimisers: lookup by name, defaults and weight decay; clipping gradients with few operations."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -79,24 +79,3 @@ def clip_grad_norm(parameters: Iterable[nn.Parameter], max_norm: float | None) -
     if max_norm is not None and (norm.is_cuda or norm > max_norm):  # on a GPU, the comparison would force a synchronisation
         th._foreach_mul_(gradients, (max_norm / (norm + 1e-6)).clamp(max=1.0))
     return norm
-
-
-def assign_gradients(loss: th.Tensor, parameters: Iterable[nn.Parameter]) -> None:
-    """
-    As ``loss.backward()``, but replaces the gradients of the parameters instead of accumulating them, which saves one
-    operation per parameter. The gradient of a frozen parameter, or of one that the loss does not depend on, becomes
-    ``None``. As with ``backward``, a gradient has the strides of its parameter: a fused optimiser reads both in the order
-    of memory.
-
-    :param loss: ()
-    :param parameters: the trained parameters
-    """
-    trained = []
-    for parameter in parameters:
-        parameter.grad = None
-        if parameter.requires_grad:
-            trained.append(parameter)
-    for parameter, gradient in zip(trained, th.autograd.grad(loss, trained, allow_unused=True), strict=True):
-        if gradient is not None and gradient.stride() != parameter.stride():
-            gradient = th.empty_like(parameter).copy_(gradient)
-        parameter.grad = gradient

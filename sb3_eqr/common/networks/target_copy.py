@@ -46,13 +46,11 @@ class TargetCopy:
 
     def _found(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
         if self._parameters is None:
-            online, target = (
-                [part for network in side for part in network.modules()] for side in zip(*self.pairs, strict=True)
-            )
-            tied = {id(copy): (own, copy) for own, copy in zip(_own_parameters(online), _own_parameters(target), strict=True)}
-            self._parameters = [own for own, _ in tied.values()], [copy for _, copy in tied.values()]
+            modules = [pair for a, b in self.pairs for pair in zip(a.modules(), b.modules(), strict=True)]
+            parameters = [pair for a, b in self.pairs for pair in zip(a.parameters(), b.parameters(), strict=True)]
+            self._parameters = [own for own, _ in parameters], [copy for _, copy in parameters]
             self._buffers, self._of_features = [], []
-            for module, its_copy in zip(online, target, strict=True):
+            for module, its_copy in modules:
                 # The buffers themselves, because the tensors of a state dict stop sharing their memory once pickled.
                 found, copies = dict(module.named_buffers(recurse=False)), dict(its_copy.named_buffers(recurse=False))
                 for name in (name for name in found if name in module.state_dict()):
@@ -61,7 +59,3 @@ class TargetCopy:
                     else:
                         self._buffers.append((module, name, copies[name]))
         return self._parameters
-
-
-def _own_parameters(modules: Sequence[nn.Module]) -> list[th.Tensor]:
-    return [parameter for module in modules for parameter in module.parameters(recurse=False)]
