@@ -215,26 +215,32 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def _windows(self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SequenceReplayBufferSamples:
         """The windows of environments ``envs``, (B,), that start at ``positions``, (B,)."""
-        n, depth = self.n_steps, self.prediction_depth
-        columns = envs[:, None]
-        steps = np.arange(max(n, depth))
+        columns, steps = envs[:, None], np.arange(max(self.n_steps, self.prediction_depth))
         window = (positions[:, None] + steps) % self.buffer_size  # (B, W)
         # The newest transition ends a window, because the oldest data follow the write position.
-        ends = (self.dones[window, columns] + self.timeouts[window, columns] > 0) | (
+        is_end = (self.dones[window, columns] + self.timeouts[window, columns] > 0) | (
             window == (self.pos - 1) % self.buffer_size
         )
-        first_end = np.where(ends.any(axis=1), ends.argmax(axis=1), len(steps) - 1)  # (B,)
+        first_end = np.where(is_end.any(axis=1), is_end.argmax(axis=1), len(steps) - 1)  # (B,)
         rewards = self._normalize_reward(self.rewards[window, columns], env)  # (B, W)
+        samples = self._transitions(positions, envs, first_end, rewards, env)
+        if self.prediction_depth == 0:
+            return samples
+        return samples._replace(**self._rollouts(positions, columns, first_end, rewards, env))
 
-        # The n-step transition: rewards up to its end, and the next observation for bootstrapping.
+    def _transitions(
+        self, positions: np.ndarray, envs: np.ndarray, first_end: np.ndarray, rewards: np.ndarray, env: VecNormalize | None
+    ) -> SequenceReplayBufferSamples:
+        """The n-step transitions: rewards up to the end, and the next observation for bootstrapping."""
+        n = self.n_steps
         last_step = np.minimum(first_end, n - 1)
-        included = steps[:n] <= last_step[:, None]  # (B, n)
+        included = np.arange(n) <= last_step[:, None]  # (B, n)
         powers = self.gamma ** np.arange(n, dtype=np.float32)
         returns = (rewards[:, :n] * powers * included).sum(axis=1, keepdims=True)  # (B, 1)
         discounts = self.gamma ** included.sum(axis=1, keepdims=True).astype(np.float32)  # (B, 1)
         last = (positions + last_step) % self.buffer_size
         dones = (self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None]  # (B, 1)
-        samples = SequenceReplayBufferSamples(
+        return SequenceReplayBufferSamples(
             observations=self._observations(positions, envs, env),
             actions=self._tensor(self.actions[positions, envs]),
             next_observations=self._observations(last, envs, env, following=True),
@@ -244,18 +250,21 @@ class SequenceReplayBuffer(ReplayBuffer):
             indices=positions * self.n_envs + envs,
             weights=self._tensor(np.ones(len(positions), dtype=np.float32)),
         )
-        if depth == 0:
-            return samples
-        mask = steps[:depth] <= first_end[:, None]  # (B, M)
-        # Beyond the end, repeat the last transition, so that no data of another episode get in, masked or not.
-        rollout = (positions[:, None] + np.minimum(steps[:depth], first_end[:, None])) % self.buffer_size
+
+    def _rollouts(
+        self, positions: np.ndarray, columns: np.ndarray, first_end: np.ndarray, rewards: np.ndarray, env: VecNormalize | None
+    ) -> dict[str, Any]:
+        """The M steps of the rollouts. Beyond the end, they repeat the last: no data of another episode, masked or not."""
+        steps, depth = np.arange(self.prediction_depth), self.prediction_depth
+        mask = steps <= first_end[:, None]  # (B, M)
+        rollout = (positions[:, None] + np.minimum(steps, first_end[:, None])) % self.buffer_size
         actions = self.actions[rollout, columns]  # (B, M, action_dim)
-        return samples._replace(
-            rollout_observations=self._observations(rollout, columns, env, following=True),
-            rollout_actions=self._tensor(actions[..., 0] if isinstance(self.action_space, spaces.Discrete) else actions),
-            rollout_rewards=self._tensor((rewards[:, :depth] * mask).astype(np.float32, copy=False)),
-            mask=self._tensor(mask.astype(np.float32)),
-        )
+        return {
+            "rollout_observations": self._observations(rollout, columns, env, following=True),
+            "rollout_actions": self._tensor(actions[..., 0] if isinstance(self.action_space, spaces.Discrete) else actions),
+            "rollout_rewards": self._tensor((rewards[:, :depth] * mask).astype(np.float32, copy=False)),
+            "mask": self._tensor(mask.astype(np.float32)),
+        }
 
     def _observations(
         self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None, following: bool = False
