@@ -28,6 +28,8 @@ from sb3_contrib.crossq.policies import Actor as CrossQActor
 from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -47,7 +49,7 @@ PIXELS, N_TORQUES = "PixelPendulum-v0", 201
 NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
 COMPARED = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5"]
 TASKS = [*COMPARED, "HalfCheetah-v5+noise", PIXELS]
-N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN = 100_000, 12_000, 2_000, 10_000
+N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN, N_GREEDY = 100_000, 12_000, 2_000, 10_000, 10
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
@@ -216,8 +218,17 @@ def train(
             callbacks.append(ExactCheckpointCallback(N_BETWEEN, checkpoints, keep=1))
         model.learn(steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=model.num_timesteps == 0)
         model.save(file.with_suffix(".zip"))  # for sb3-eqr visualize
-        run = {"arm": arm, "task": task, "seed": seed, "steps": steps, "seconds": round(model.seconds)}
-        run = {**run, "torch": th.__version__, "training": model.episodes}
+        tests = make_vec_env(lambda task=task: make_env(task), seed=N_STEPS)  # type: ignore[misc]
+        greedy, _ = evaluate_policy(model, tests, n_eval_episodes=N_GREEDY, return_episode_rewards=True)
+        run = {
+            "arm": arm,
+            "task": task,
+            "seed": seed,
+            "steps": steps,
+            "seconds": round(model.seconds),
+            "torch": th.__version__,
+        }
+        run = {**run, "greedy": greedy, "training": model.episodes}
         with atomic_write(file, "json") as out:
             out.write(json.dumps(run).encode())
         shutil.rmtree(file.with_suffix(""), ignore_errors=True)
@@ -270,18 +281,28 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
 
 
 def report(
-    runs: dict[tuple[str, str], dict[int, dict[str, Any]]], baseline: str, after: int, cost: float, until: int = N_STEPS
+    runs: dict[tuple[str, str], dict[int, dict[str, Any]]],
+    baseline: str,
+    after: int,
+    cost: float,
+    until: int = N_STEPS,
+    is_greedy: bool = False,
 ) -> str:
     """
     Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
     over tasks, bootstrap interval over seeds; and the IQM of all areas, each divided by the baseline's mean. The areas of all
-    but the baseline end after 1 / ``cost`` of the steps, and all at ``until``.
+    but the baseline end after 1 / ``cost`` of the steps, and all at ``until``. With ``is_greedy``, areas are replaced by the
+    mean return after training, without exploration noise.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
     for key, of_key in runs.items():
         share = 1.0 if key[1] == baseline else 1 / cost
-        areas[key] = np.array([area(run, after, min(share * run["steps"], until)) for run in of_key.values()])
+        found = [
+            np.mean(run["greedy"]) if is_greedy else area(run, after, min(share * run["steps"], until))
+            for run in of_key.values()
+        ]
+        areas[key] = np.array(found)
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
     for arm in ARMS:
@@ -353,6 +374,7 @@ def main() -> None:
     reporting.add_argument(
         "--cost", type=float, default=1.0, help="compare in the same time, if a step takes so many times as long as that arm's"
     )
+    reporting.add_argument("--greedy", action="store_true", help="compare returns after training, without exploration noise")
     reporting.add_argument("--pack", type=pathlib.Path, help="also write all runs into this file, packed by xz")
     args = parser.parse_args()
     if args.command == "train":
@@ -372,7 +394,7 @@ def main() -> None:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
         draw(rows(runs, ["none", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
-    print(report(runs, args.to, args.after, args.cost, args.until))
+    print(report(runs, args.to, args.after, args.cost, args.until, args.greedy))
 
 
 if __name__ == "__main__":
