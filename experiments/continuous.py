@@ -11,26 +11,23 @@ earlier agent that EqRSAC equals to rounding, but for the spread of the first re
 """
 
 import argparse
-import inspect
 import json
 import lzma
 import pathlib
 import shutil
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from sb3_contrib import TQC, CrossQ
-from sb3_contrib.crossq.policies import Actor as CrossQActor
-from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
@@ -40,10 +37,8 @@ from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.benchmark.statistics import estimate, iqm
 from sb3_eqr.common.actor_critic import EqRActorCritic
-from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy, PredictsState, ReadsLatent
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
-from sb3_eqr.eqr_sac import EqRSACPolicy
 
 PIXELS, N_TORQUES = "PixelPendulum-v0", 201
 NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
@@ -66,10 +61,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "t72": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1}},  # as many, without rotation
     "lean": {"policy_kwargs": LEAN},
     "lean_64": {"policy_kwargs": LEAN, "latent_batch_size": 64},
-    "lean_64_layer_norm": {"policy_kwargs": LEAN, "latent_batch_size": 64},
-    "eqr_crossq": {"policy_kwargs": LEAN},
-    "eqr_crossq_no_losses": {"policy_kwargs": LEAN, "prediction_depth": 0},
-    "eqr_crossq_16": {"policy_kwargs": {**LEAN, "group": "T(16)"}},
     "no_losses": {"prediction_depth": 0},
     "no_features": {"policy_kwargs": {"reads_features": False}},
     "one_step": {"prediction_depth": 1},
@@ -82,65 +73,22 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 
 
-class WithLayerNorm:
-    """Mixin, listed before a policy of SAC: layer norm after each hidden linear layer of actor and critics."""
+class LayerNormPolicy(SACPolicy):
+    """SAC's policy with layer norm after each hidden linear layer of actor and critics."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        actor: Actor = super().make_actor(features_extractor)  # type: ignore[misc]
-        arch: Any = self.actor_kwargs["net_arch"]  # type: ignore[attr-defined]
+        actor, arch = super().make_actor(features_extractor), cast(list[int], self.actor_kwargs["net_arch"])
         actor.latent_pi = nn.Sequential(*create_mlp(actor.features_dim, -1, arch, nn.ReLU, post_linear_modules=[nn.LayerNorm]))
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        critic: ContinuousCritic = super().make_critic(features_extractor)  # type: ignore[misc]
+        critic, arch = super().make_critic(features_extractor), cast(list[int], self.critic_kwargs["net_arch"])
         first: Any = critic.q_networks[0]
-        arch: Any = self.critic_kwargs["net_arch"]  # type: ignore[attr-defined]
         for i in range(critic.n_critics):
             made = nn.Sequential(*create_mlp(first[0].in_features, 1, arch, nn.ReLU, post_linear_modules=[nn.LayerNorm]))
             critic.q_networks[i] = made
             setattr(critic, f"qf{i}", made)
         return critic
-
-
-class LayerNormPolicy(WithLayerNorm, SACPolicy):
-    """SAC's policy with layer norm."""
-
-
-class EqRLayerNormPolicy(WithLayerNorm, EqRSACPolicy):
-    """EqRSAC's policy with layer norm."""
-
-
-class EqRCrossQActor(ReadsLatent, CrossQActor):
-    """CrossQ's actor, which reads the latent state."""
-
-
-class EqRCrossQCritic(PredictsState, CrossQCritic):
-    """CrossQ's critics, which read the latent state and the predicted next one."""
-
-
-class EqRCrossQPolicy(EqRActorCriticPolicy, CrossQPolicy):
-    """CrossQ's policy with a latent model, and CrossQ's momentum for all optimisers."""
-
-    actor_class = EqRCrossQActor
-    critic_class = EqRCrossQCritic
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"optimizer_kwargs": {"betas": (0.5, 0.999)}, **kwargs})
-
-
-class EqRCrossQ(EqRActorCritic, CrossQ):
-    """CrossQ with a latent model, as EqRSAC: a prototype."""
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {**EqRSAC.policy_aliases, "MlpPolicy": EqRCrossQPolicy}
-    policy: EqRCrossQPolicy  # type: ignore[assignment]
-
-    def __init__(self, policy: str, env: gym.Env, **kwargs: Any):
-        losses = {"prediction_depth": 2, "aet_coef": 1.0, "symmetry_coef": 0.0, "reward_coef": 1.0, "latent_batch_size": None}
-        of_crossq = {name: p.default for name, p in inspect.signature(CrossQ).parameters.items() if p.default is not p.empty}
-        super().__init__(policy, env, **{**of_crossq, **losses, **kwargs})
-
-
-POLICIES = {"sac_layer_norm": LayerNormPolicy, "lean_64_layer_norm": EqRLayerNormPolicy}
 
 
 class Episodes(BaseCallback):
@@ -196,8 +144,7 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
-    kind: Any = POLICIES.get(arm, policy)
-    return (EqRCrossQ if arm.startswith("eqr_crossq") else OTHERS.get(arm, EqRSAC))(kind, env, **given, **shared)
+    return OTHERS.get(arm, EqRSAC)(LayerNormPolicy if arm == "sac_layer_norm" else policy, env, **given, **shared)
 
 
 def train(
