@@ -12,8 +12,8 @@ from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
 from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
-from sb3_eqr.common.objective import LatentObjective, keep_freed_memory
-from sb3_eqr.common.off_policy import EqROffPolicy
+from sb3_eqr.common.objective import LatentObjective
+from sb3_eqr.common.off_policy import EqROffPolicy, keep_freed_memory
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 

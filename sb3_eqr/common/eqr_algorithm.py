@@ -17,8 +17,8 @@ from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedUpdate
 from sb3_eqr.common.networks.optimizers import clip_grad_norm, set_adam_defaults
-from sb3_eqr.common.objective import Objective, keep_freed_memory
-from sb3_eqr.common.off_policy import EqROffPolicy
+from sb3_eqr.common.objective import Objective
+from sb3_eqr.common.off_policy import EqROffPolicy, keep_freed_memory
 from sb3_eqr.common.policies import EqRPolicy
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.resets import Resets, ResetSchedule

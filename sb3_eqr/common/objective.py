@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
 import torch as th
 from torch import nn
 
@@ -189,13 +188,3 @@ def flat(observations: PyTorchObs) -> PyTorchObs:
     if isinstance(observations, dict):
         return {key: obs.flatten(0, 1) for key, obs in observations.items()}
     return observations.flatten(0, 1)
-
-
-def keep_freed_memory() -> None:
-    """
-    Make the C library keep freed memory. On Linux, it returns large blocks to the system and requests them again page by
-    page, which causes thousands of page faults per update with Atari frames. Its threshold for large blocks adapts to the
-    largest block freed so far (mallopt(3), M_MMAP_THRESHOLD; blocks above 32 MiB do not count), and it then keeps up to
-    twice as much. This function therefore frees one such block.
-    """
-    np.empty(31 << 20, dtype=np.uint8)

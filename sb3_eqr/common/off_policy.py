@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -189,3 +190,13 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite
+
+
+def keep_freed_memory() -> None:
+    """
+    Make the C library keep freed memory. On Linux, it returns large blocks to the system and requests them again page by
+    page, which causes thousands of page faults per update with Atari frames. Its threshold for large blocks adapts to the
+    largest block freed so far (mallopt(3), M_MMAP_THRESHOLD; blocks above 32 MiB do not count), and it then keeps up to
+    twice as much. This function therefore frees one such block.
+    """
+    np.empty(31 << 20, dtype=np.uint8)
