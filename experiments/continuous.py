@@ -335,6 +335,9 @@ def main() -> None:
         print(still())
         return
     runs = read(args.paths)
+    if args.greedy:  # older runs were not evaluated
+        runs = {key: {seed: run for seed, run in found.items() if "greedy" in run} for key, found in runs.items()}
+        runs = {key: found for key, found in runs.items() if found}
     if args.pack is not None:
         lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
         with atomic_write(args.pack, "xz") as out:

@@ -77,7 +77,7 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
     The agent of a YAML file: entries, or ``base``, the ENTRIES or file to start from, and ``changes`` of all entries; ``name``
     is that of one of several such pairs in the file.
     """
-    found = read_yaml(file)
+    found = read_yaml(file, "--agents: ")
     if name is not None:
         if name not in found:
             raise ValueError(f"--agents: {file} has no agent {name!r}.{nearest_name(name, map(str, found))}")

@@ -1,5 +1,5 @@
 """
-The figures of a report, drawn with rliable and seaborn: counterparts of Figures 4 and 5 of the EqR paper, and curves over
+The figures of a report, counterparts of Figures 4 and 5 of the EqR paper, and curves over
 training.
 """
 

@@ -172,7 +172,7 @@ def load_suite(name: str, file: pathlib.Path | None = None) -> Suite:
     if file is not None:
         if not file.is_file():
             raise ValueError(f"--suite-file: there is no file {file}")
-        entries |= {key: (file, entry) for key, entry in read_yaml(file).items()}
+        entries |= {key: (file, entry) for key, entry in read_yaml(file, "--suite-file: ").items()}
     if name not in entries:
         nearby = nearest_name(name, entries)
         raise ValueError(f"--suite: there is no suite {name!r}.{nearby} --suite-file FILE adds suites of your own.")

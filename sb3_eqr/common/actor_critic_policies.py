@@ -357,6 +357,14 @@ class EqRActorCriticPolicy(BasePolicy):
             self.latent_encoder.eval()
             self.latent_target.eval()
 
+    def train(self, mode: bool = True) -> "EqRActorCriticPolicy":
+        """As PyTorch's, but the moving average stays in eval mode."""
+        super().train(mode)
+        if self.has_latent:
+            self.latent_encoder.eval()
+            self.latent_target.eval()
+        return self
+
     @property
     def description(self) -> dict[str, str]:
         """Properties that the parameters' shapes do not determine, by name; saved in the model's file."""

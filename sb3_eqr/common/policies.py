@@ -319,7 +319,10 @@ class EqRPolicy(BasePolicy):
         """Put all trained modules into train or eval mode; the target copies stay in eval mode."""
         if mode == self.training:
             return  # SB3 calls this at every environment step, and visiting all modules is slow
-        self.train(mode)
+        super().set_training_mode(mode)
+        self.latent_model.train(mode)
+        for module in self._frozen:
+            module.eval()
 
     def train(self, mode: bool = True) -> "EqRPolicy":
         """As PyTorch's, but target copies and frozen modules stay in eval mode."""

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
     model = load_model(args.model, args.algo, args.device, args.trust)
     kwargs = parse_kwargs(args.env_kwargs)
     try:
-        env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.trust, args.gym_packages)
+        env = make_env(model, args.model, args.env, kwargs, args.n_envs, args.seed, args.video, args.trust, args.gym_packages)
         played = play(model, env, args.steps, args.depth, args.deterministic, args.seed)
     except ValueError as error:
         name, space, message = str(error).partition(" ")

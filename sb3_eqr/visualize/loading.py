@@ -3,8 +3,10 @@
 import ast
 import pathlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
@@ -57,6 +59,7 @@ def make_env(
     env_kwargs: dict[str, Any] | None = None,
     n_envs: int = 1,
     seed: int = 0,
+    render: bool = False,
     trust: bool = False,
     packages: Sequence[str] = (),
 ) -> VecEnv:
@@ -70,6 +73,7 @@ def make_env(
     :param env_kwargs: arguments of the environment's constructor
     :param n_envs: number of environments
     :param seed: seed of the first environment
+    :param render: whether the environment of RL Zoo's files is made to render
     :param trust: whether the files next to the model may name code that runs
     :param packages: packages whose code they may name in any case
     :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
@@ -81,7 +85,7 @@ def make_env(
         check_zoo_folder(folders[0], packages)
     arguments = read_trusted(folders[0] / "args.yml") if folders else {}
     if folders and env_id in (None, arguments["env"]):
-        env = _zoo_env(folders[0], arguments, kwargs, n_envs, seed)
+        env = _zoo_env(folders[0], arguments, kwargs, n_envs, seed, render)
     elif env_id is None:
         raise ValueError(f"--env must be the agent's environment, got none, and RL Zoo's args.yml is not next to {path}.")
     elif env_id.startswith("ALE/") or "NoFrameskip" in env_id:
@@ -100,7 +104,9 @@ def make_env(
     return as_vec_env(model, env)
 
 
-def _zoo_env(folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
+def _zoo_env(
+    folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, Any], n_envs: int, seed: int, render: bool
+) -> VecEnv:
     """The environment of the run whose arguments of ``train`` and config.yml are in a folder."""
     try:
         import rl_zoo3.import_envs  # noqa: F401 - registers Atari and others
@@ -112,7 +118,14 @@ def _zoo_env(folder: pathlib.Path, arguments: dict[str, Any], kwargs: dict[str, 
     config, _ = get_saved_hyperparams(str(folder))
     made_with = {**(config.get("env_kwargs") or {}), **(arguments.get("env_kwargs") or {}), **kwargs}
     wrap, wrap_all = get_wrapper_class(config), get_wrapper_class(config, "vec_env_wrapper")
-    env: Any = make_vec_env(arguments["env"], n_envs, seed, wrapper_class=wrap, env_kwargs=made_with)  # renders, where it can
+    make = partial(gym.make, arguments["env"])  # given its name, make_vec_env would make it render
+    try:
+        rendered = {"render_mode": "rgb_array", **made_with} if render else made_with
+        env: Any = make_vec_env(make, n_envs, seed, wrapper_class=wrap, env_kwargs=rendered)
+    except TypeError as error:
+        if "render_mode" not in str(error) or "render_mode" in made_with:
+            raise
+        env = make_vec_env(make, n_envs, seed, wrapper_class=wrap, env_kwargs=made_with)
     env = env if wrap_all is None else wrap_all(env)
     if config["normalize"]:
         env = VecNormalize.load(str(folder / "vecnormalize.pkl"), env)  # the reward predictor was trained on its rewards

@@ -50,14 +50,14 @@ def number_in(value: Any, start: str = "") -> float:
         return np.nan
 
 
-def read_yaml(path: pathlib.Path) -> dict[str, Any]:
-    """Read a YAML file; raises ValueError if it is not valid, or not a mapping."""
+def read_yaml(path: pathlib.Path, where: str = "") -> dict[str, Any]:
+    """Read a YAML file; raises ValueError, with ``where`` before its message, if it is not valid, or not a mapping."""
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
-        raise ValueError(f"{path} must be valid YAML, got: {error}") from error
+        raise ValueError(f"{where}{path} must be valid YAML, got: {error}") from error
     if not isinstance(found, dict):
-        raise ValueError(f"{path} must be a mapping, got {found!r:.60}.")
+        raise ValueError(f"{where}{path} must be a mapping, got {found!r:.60}.")
     return found
 
 

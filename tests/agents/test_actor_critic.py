@@ -504,7 +504,6 @@ def test_outside_of_updates_images_are_not_shifted(agent):
 @EACH
 def test_the_average_stays_in_eval_mode(agent):
     policy = make(agent).learn(60).policy.train()
-    policy.set_training_mode(True)
     assert policy.latent_model.training and not (policy.latent_encoder.training or policy.latent_target.training)
 
 

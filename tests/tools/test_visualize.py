@@ -329,12 +329,12 @@ def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
     assert isinstance(found, VecNormalize) and found.obs_rms.mean[0] == 7 and not found.training and found.norm_reward
     seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
     assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
-    assert found.get_attr("render_mode") == ["rgb_array"]
+    assert found.get_attr("render_mode") == [None]
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", env_kwargs={"render_mode": "rgb_array"})))
     assert loading.make_env(loaded, path).get_attr("render_mode") == ["rgb_array"]  # of a file of entries, or after --resume
     (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Dark-v0", env_kwargs=None, gym_packages=[])))
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy")))
-    assert loading.make_env(loaded, path).render_mode is None  # its environment cannot be rendered
+    assert loading.make_env(loaded, path, render=True).render_mode is None  # its environment cannot be rendered
     other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
     assert other.num_envs == 2
 

@@ -80,7 +80,7 @@ def discard(checkpoint: pathlib.Path) -> None:
 
 def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
     """The arguments of an agent, its spaces and its environment as plain data, to distinguish its run from others."""
-    of_sac = ("ent_coef", "target_entropy", "use_sde")  # which have no rule
+    of_sac = ("ent_coef", "target_entropy", "use_sde", "sde_sample_freq", "use_sde_at_warmup")  # which have no rule
     names = [name for name in (*getattr(model, "rules", ALGORITHM), *of_sac) if name not in ("verbose", "tensorboard_log")]
     found = {name: without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
     spaces = {"observation_space": repr(model.observation_space), "action_space": repr(model.action_space)}
