@@ -167,15 +167,8 @@ def train(
         model.save(file.with_suffix(".zip"))  # for sb3-eqr visualize
         tests = make_vec_env(lambda task=task: make_env(task), seed=N_STEPS)  # type: ignore[misc]
         greedy, _ = evaluate_policy(model, tests, n_eval_episodes=N_GREEDY, return_episode_rewards=True)
-        run = {
-            "arm": arm,
-            "task": task,
-            "seed": seed,
-            "steps": steps,
-            "seconds": round(model.seconds),
-            "torch": th.__version__,
-        }
-        run = {**run, "greedy": greedy, "training": model.episodes}
+        run = {"arm": arm, "task": task, "seed": seed, "steps": steps, "seconds": round(model.seconds)}
+        run |= {"torch": th.__version__, "greedy": greedy, "training": model.episodes}
         with atomic_write(file, "json") as out:
             out.write(json.dumps(run).encode())
         shutil.rmtree(file.with_suffix(""), ignore_errors=True)

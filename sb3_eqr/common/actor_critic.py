@@ -76,7 +76,7 @@ class EqRActorCritic(EqROffPolicy):
             raise ValueError(f"replay_buffer_class must sample uniformly, because {name} computes no priorities.")
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        check_arguments(vars(self), RULES)  # attributes may have been changed
+        check_arguments(vars(self), self.rules)  # attributes may have been changed
         self._check_losses()
         result = super()._setup_learn(*args, **kwargs)
         validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)

@@ -277,7 +277,7 @@ class EqRAlgorithm(EqROffPolicy):
         return self._new_replay_buffer(self.replay_buffer_class or default, longest)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        check_arguments(vars(self), ALGORITHM)  # attributes may have been changed
+        check_arguments(vars(self), self.rules)  # attributes may have been changed
         self._check_losses()
         self._check_losses_of_policy()
         if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):

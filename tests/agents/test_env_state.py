@@ -41,7 +41,7 @@ IDS = ("Acrobot-v1", "MountainCar-v0", "FrozenLake-v1", "Taxi-v4", "CliffWalking
 WORLDS = {
     "cartpole": lambda seed: VecNormalize(make_vec_env("CartPole-v1", 4, seed)),
     "processes": lambda seed: VecNormalize(
-        make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORK, wrapper_class=ResumableWrapper)
+        make_vec_env("CartPole-v1", 2, seed, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
     ),
     "statistics": lambda seed: VecMonitor(DummyVecEnv([lambda: timed(gym.make("CartPole-v1"))])),
     **{name: lambda seed, name=name: make_vec_env(name, 2, seed) for name in IDS},

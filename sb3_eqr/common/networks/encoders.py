@@ -200,7 +200,7 @@ class MlpExtractor(BaseFeaturesExtractor):
     features.
 
     :param observation_space: any space except ``Dict``
-    :param features_dim: size of every layer
+    :param features_dim: size of the layer
     """
 
     def __init__(self, observation_space: spaces.Space, features_dim: int = 256):
@@ -220,7 +220,7 @@ class MlpExtractor(BaseFeaturesExtractor):
 
 
 class TwoLayerExtractor(MlpExtractor):
-    """Flatten, a linear layer, layer norm, ELU and a second linear layer: an encoder for vectors. Same parameters."""
+    """Flatten, a linear layer, layer norm, ELU and a second linear layer of the same size: an encoder for vectors."""
 
     @staticmethod
     def make_layers(n_in: int, n_out: int) -> list[nn.Module]:
