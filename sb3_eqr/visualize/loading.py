@@ -2,7 +2,7 @@
 
 import ast
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -73,7 +73,7 @@ def make_env(
     :param env_kwargs: arguments of the environment's constructor
     :param n_envs: number of environments
     :param seed: seed of the first environment
-    :param render: whether the environment of RL Zoo's files is made to render
+    :param render: whether the environment is made to render, if it can
     :param trust: whether the files next to the model may name code that runs
     :param packages: packages whose code they may name in any case
     :raises ValueError: if the environment is unknown or does not fit the agent, or its files need ``trust``
@@ -93,7 +93,7 @@ def make_env(
             raise ValueError(f"--env-kwargs must be empty for Atari, whose protocol is fixed, got {kwargs}.")
         env = make_atari100k_env(env_id, n_envs, seed, training=True)
     else:
-        env = _plain_env(env_id, kwargs, n_envs, seed)
+        env = _plain_env(env_id, kwargs, n_envs, seed, render)
     statistics = path.parent / "vecnormalize.pkl"
     if unwrap_vec_normalize(env) is None and statistics.is_file():
         if not trust:
@@ -118,24 +118,35 @@ def _zoo_env(
     config, _ = get_saved_hyperparams(str(folder))
     made_with = {**(config.get("env_kwargs") or {}), **(arguments.get("env_kwargs") or {}), **kwargs}
     wrap, wrap_all = get_wrapper_class(config), get_wrapper_class(config, "vec_env_wrapper")
-    make = partial(gym.make, arguments["env"])  # given its name, make_vec_env would make it render
-    try:
-        rendered = {"render_mode": "rgb_array", **made_with} if render else made_with
-        env: Any = make_vec_env(make, n_envs, seed, wrapper_class=wrap, env_kwargs=rendered)
-    except TypeError as error:
-        if "render_mode" not in str(error) or "render_mode" in made_with:
-            raise
-        env = make_vec_env(make, n_envs, seed, wrapper_class=wrap, env_kwargs=made_with)
+    env: Any = _make_envs(arguments["env"], made_with, n_envs, seed, render, wrap)
     env = env if wrap_all is None else wrap_all(env)
     if config["normalize"]:
-        env = VecNormalize.load(str(folder / "vecnormalize.pkl"), env)  # the reward predictor was trained on its rewards
+        statistics = folder / "vecnormalize.pkl"
+        if not statistics.is_file():
+            raise ValueError(f"{statistics} must exist, because the agent was trained with normalize: true. Copy it there.")
+        env = VecNormalize.load(str(statistics), env)  # the reward predictor was trained on its rewards
     return VecFrameStack(env, config["frame_stack"]) if config.get("frame_stack") else env
 
 
-def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int) -> VecEnv:
+def _make_envs(
+    env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int, render: bool, wrap: Callable[[gym.Env], gym.Env] | None
+) -> VecEnv:
+    """Environments that render if asked and able to."""
+    make = partial(make_vec_env, partial(gym.make, env_id), n_envs, seed, wrapper_class=wrap)  # by name, all would render
+    if not render or "render_mode" in kwargs:
+        return make(env_kwargs=kwargs)
+    try:
+        return make(env_kwargs={"render_mode": "rgb_array", **kwargs})
+    except TypeError as error:
+        if "render_mode" not in str(error):
+            raise
+        return make(env_kwargs=kwargs)
+
+
+def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int, render: bool) -> VecEnv:
     check_registered(env_id, "--env")
     try:
-        return make_vec_env(env_id, n_envs, seed, env_kwargs=kwargs)  # sets render_mode where supported
+        return _make_envs(env_id, kwargs, n_envs, seed, render, None)
     except TypeError as error:
         raise ValueError(f"--env-kwargs: {env_id} does not accept {kwargs} ({error}).") from error
 

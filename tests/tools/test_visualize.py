@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecCheckNan, VecFrameStack, VecNormalize
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, visualize
 from sb3_eqr.common.saving.plain_data import encode as encode_plain
@@ -336,7 +336,29 @@ def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy")))
     assert loading.make_env(loaded, path, render=True).render_mode is None  # its environment cannot be rendered
     other = loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, n_envs=2)
-    assert other.num_envs == 2
+    assert other.num_envs == 2 and other.render_mode is None
+    assert loading.make_env(loaded, path, "Ring-v0", {"unwound": False}, render=True).render_mode == "rgb_array"
+
+
+def test_wrappers_of_rl_zoos_files_are_applied_in_its_order(folder):
+    model = make_model(env=VecFrameStack(make_vec_env(functools.partial(Ring, keys=False)), 2))
+    path = folder.parent / "best_model.zip"
+    model.save(path)
+    wrappers = {
+        "env_wrapper": "gymnasium.wrappers.FlattenObservation",
+        "vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan",
+    }
+    (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", frame_stack=2, **wrappers)))
+    stack = loading.make_env(model, path)
+    assert isinstance(stack, VecFrameStack) and isinstance(stack.venv, VecCheckNan)
+    assert stack.env_is_wrapped(gym.wrappers.FlattenObservation) == [True]
+
+
+def test_statistics_of_a_normalised_run_must_be_there(folder):
+    model = make_model()
+    model.save(folder.parent / "best_model")
+    with pytest.raises(ValueError, match=r"vecnormalize\.pkl must exist, because the agent was trained with normalize: true"):
+        loading.make_env(model, folder.parent / "best_model.zip")
 
 
 @pytest.mark.parametrize(
