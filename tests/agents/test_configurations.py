@@ -6,12 +6,14 @@ import warnings
 
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer, load_configuration
-from sb3_eqr.benchmark.agents import find_agent
+from sb3_eqr.benchmark.agents import find_agent, hyperparameters
+from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.common.networks.encoders import ImpalaTrunk, NormalizedExtractor
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
@@ -35,7 +37,7 @@ EXPECTED = {
 }
 FULL = ("eqr_rainbow", "paper", "released", "se2+aet+r+get", "eqr_bbf")
 EXPECTED |= dict.fromkeys(FULL, ("SE(2)^12", {"aet", "symmetry", "reward"}))
-EXPECTED |= dict.fromkeys(("rainbow", "rainbow_resets", "qrdqn", "der", "drq"), (None, set()))
+EXPECTED |= dict.fromkeys(("rainbow", "qrdqn", "der", "drq"), (None, set()))
 
 
 # The agents of the paper's Tables 3 and 4, and of its released commands: what differs from "paper"
@@ -109,19 +111,6 @@ def test_table_5(kind, name):
     assert [part.kernel_size[0] for part in convolutions] == [8, 4, 3]
 
 
-def test_the_full_agent_is_the_default():
-    """Every line of eqr_rainbow.yml repeats a default."""
-    env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
-    default, named = EqRRainbow("CnnPolicy", env), EqRRainbow("CnnPolicy", env, **load_configuration("eqr_rainbow"))
-    default._setup_learn(100_000, None)  # learning_starts follows the length of the run
-    assert default.train_freq == named.train_freq and default.policy.latent_model.n_blocks == 12
-    written = load_configuration("eqr_rainbow")
-    written |= written.pop("replay_buffer_kwargs") | written.pop("policy_kwargs")
-    found = {**vars(default.replay_buffer), **vars(default.policy), **vars(default.policy.options), **vars(default)}
-    found |= {"train_freq": written["train_freq"], "n_blocks": 12}
-    assert {key: found[key] for key in written} == written
-
-
 def nonzero_gradients(module):
     return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
 
@@ -154,7 +143,7 @@ def test_each_configuration_trains_as_in_the_table(name):
     encoder, layer = model.policy.online.features_extractor, model.policy.group_layer
     assert (layer and f"{layer.group}^{layer.n_blocks}") == encoder_name
     noisy = any(isinstance(module, NoisyLinear) for module in model.policy.modules())
-    assert noisy == (name not in ("drq", "eqr_bbf", "rainbow_resets"))
+    assert noisy == (name not in ("drq", "eqr_bbf", "eqr_rainbow"))
     assert model.policy.latent_model.action_dim == 3
 
     # losses: exactly those of the table are logged, and they are finite
@@ -202,11 +191,13 @@ def test_eqr_bbf_follows_the_papers_recipe():
     assert model.policy.act_with_target and model.double_q
 
 
-def test_rainbow_resets_is_the_agent_of_our_atari_runs():
-    """The plan of those runs has its own file, as it was written before them."""
-    planned = find_agent(f"eqr_rainbow:{ROOT}/experiments/settings/atari/slow_target.yml")
-    full = load_configuration("eqr_rainbow")
-    assert merged(full, load_configuration("rainbow_resets")) == merged(full, planned.changes)
+def test_atari_has_the_recipe_of_our_runs():
+    """The plan of those runs has its own file, older than they are, which repeats three defaults."""
+    protocol = load_suite("atari100k").protocol("Boxing")
+    agents = find_agent("eqr_rainbow"), find_agent(f"eqr_rainbow:{ROOT}/experiments/settings/atari/slow_target_eqr.yml")
+    recipe, planned = (hyperparameters(agent, protocol, spaces.Discrete(6)) for agent in agents)
+    repeated = {"prediction_depth": 5, "symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(2)"}}
+    assert merged(repeated, recipe) == planned
 
 
 @pytest.mark.parametrize("path", configuration_files().values(), ids=lambda path: path.stem)
