@@ -1,10 +1,9 @@
 """
 EqRSAC against SB3's SAC: the gate, the comparison, and short runs with small networks. The plans, each older than its first
-run, are in experiments/settings/continuous/README.md. Runs of the gate in docs/results/continuous_gate.xz are those of an
-earlier agent that EqRSAC equals to rounding, but for the spread of the first rewards.
+run, are in experiments/settings/continuous/README.md.
 
-    python -m experiments.continuous train runs/continuous --tasks Ant-v5 --arms sac none --seeds 0
-    python -m experiments.continuous train runs/short --short --tasks HalfCheetah-v5 --arms sac none --seeds 100
+    python -m experiments.continuous train runs/continuous --tasks Ant-v5 --arms sac eqr_sac --seeds 0
+    python -m experiments.continuous train runs/short --short --tasks HalfCheetah-v5 --arms sac eqr_sac --seeds 200
     python -m experiments.continuous time
     python -m experiments.continuous still
     python -m experiments.continuous report docs/results/continuous_gate.xz
@@ -48,28 +47,23 @@ N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN, N_GREEDY = 100_000, 12_000, 2_000, 
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
-NARROW_READ: dict[str, Any] = {"latent_hidden_dim": 128, "features_extractor_kwargs": {"features_dim": 128}}
-LEAN: dict[str, Any] = {"group": "T(72)", "n_blocks": 1, "reads_features": False}
-NARROW = {**NARROW_READ, "reads_features": False}
 OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC}
-# name -> arguments of these, or of EqRSAC, whose defaults are those of "none"
+
+
+def first_version(group: str) -> dict[str, Any]:
+    """Arguments of EqRSAC as it was at first: actor and critics also read h(s), and the latent model has larger batches."""
+    return {"policy_kwargs": {"group": group, "reads_features": True}, "latent_batch_size": None}
+
+
+# name -> arguments of these, or of EqRSAC; packed runs have more arms
 ARMS: dict[str, dict[str, Any]] = {
     **{name: {} for name in OTHERS},
     "sac_two_updates": {"gradient_steps": 2},
-    "none": {},
-    "se2": {"policy_kwargs": {"group": "SE(2)"}},  # 12 blocks have as many numbers as the default
-    "t72": {"policy_kwargs": {"group": "T(72)", "n_blocks": 1}},  # as many, without rotation
-    "lean": {"policy_kwargs": LEAN},
-    "lean_64": {"policy_kwargs": LEAN, "latent_batch_size": 64},
+    "eqr_sac": {},
     "no_losses": {"prediction_depth": 0},
-    "no_features": {"policy_kwargs": {"reads_features": False}},
-    "one_step": {"prediction_depth": 1},
-    "five_steps": {"prediction_depth": 5},
-    "cheaper": {"policy_kwargs": {"reads_features": False}, "prediction_depth": 1},
-    "narrow": {"policy_kwargs": NARROW, "prediction_depth": 1},
-    "small": {"policy_kwargs": {**NARROW, "group": "none(32)"}, "prediction_depth": 1},
-    "narrow_two_steps": {"policy_kwargs": NARROW},
-    "narrow_read": {"policy_kwargs": NARROW_READ},
+    "none": first_version("none(72)"),
+    "se2": first_version("SE(2)"),  # 12 blocks have as many numbers
+    "t72": first_version("T(72)^1"),  # as many, without rotation
 }
 
 
@@ -245,7 +239,7 @@ def report(
         areas[key] = np.array(found)
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
-    for arm in ARMS:
+    for arm in dict.fromkeys(arm for _, arm in areas):
         cells, ratios, normalised = [], [], []
         for task in tasks:
             values, of_baseline = areas.get((task, arm)), areas[task, baseline]
@@ -293,22 +287,22 @@ def main() -> None:
     running = commands.add_parser("train", help="run what is not in the folder yet")
     running.add_argument("folder", type=pathlib.Path)
     running.add_argument("--tasks", nargs="+", default=COMPARED)
-    running.add_argument("--arms", nargs="+", default=["sac", "none"], choices=list(ARMS))
+    running.add_argument("--arms", nargs="+", default=["sac", "eqr_sac"], choices=list(ARMS))
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     running.add_argument("--short", action="store_true", help=f"{N_SHORT:,} steps with small networks")
     running.add_argument("--steps", type=int, help="stop after so many steps; a folder of its own is needed")
     timing = commands.add_parser("time", help="compare the time of a step of learning")
     timing.add_argument("--task", default=TASKS[0])
-    timing.add_argument("--arms", nargs="+", default=["sac", "narrow", "none", "se2"], choices=list(ARMS))
+    timing.add_argument("--arms", nargs="+", default=["sac", "eqr_sac", "none", "se2"], choices=list(ARMS))
     timing.add_argument("--rounds", type=int, default=10)
     timing.add_argument("--short", action="store_true", help="with small networks")
     commands.add_parser("still", help="print the returns of the action 0")
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
     reporting.add_argument(
-        "--figure", type=pathlib.Path, help="also draw the returns of sac and none in training into this file"
+        "--figure", type=pathlib.Path, help="also draw the returns of sac and eqr_sac in training into this file"
     )
-    reporting.add_argument("--to", default="sac", choices=list(ARMS), help="the arm whose area is 1")
+    reporting.add_argument("--to", default="sac", help="the arm whose area is 1")
     reporting.add_argument("--after", type=int, default=0, help="count episodes that end after this step")
     reporting.add_argument("--until", type=int, default=N_STEPS, help="count episodes that end until this step")
     reporting.add_argument(
@@ -336,7 +330,7 @@ def main() -> None:
         with atomic_write(args.pack, "xz") as out:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
-        draw(rows(runs, ["none", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
+        draw(rows(runs, ["eqr_sac", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
     print(report(runs, args.to, args.after, args.cost, args.until, args.greedy))
 
 

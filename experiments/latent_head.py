@@ -100,7 +100,7 @@ def make(task: str, arm: str, seed: int) -> EqRQRDQN:
     kind: type[EqRQRDQN] = EqRQRDQN
     if arm.startswith("head"):
         kind, group = LatentHeadQRDQN, {"group": "SE(2)", "n_blocks": 12}
-        group = {"group": "none(72)", "n_blocks": 1} if arm == "head_none" else group
+        group = {"group": "none(72)"} if arm == "head_none" else group
         kept = {name: value for name, value in settings["policy_kwargs"].items() if name not in OTHERS}
         settings |= {**LOSSES, "policy_kwargs": {**kept, **LATENT, **group}}
     return kind("MlpPolicy", make_vec_env(task, 1, seed=seed), **settings, seed=seed, device="cpu")

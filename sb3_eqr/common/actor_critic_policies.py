@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_eqr.common.checks.arguments import (
     ALGORITHM,
     FLAG,
+    NONE,
     POLICY,
     SHARE,
     TEXT,
@@ -56,7 +57,7 @@ RULES = {
     "net_arch": POLICY["net_arch"] | NET_ARCH,
     "n_critics": integer(1),
     "head_input": one_of(["latent", "observation"]),
-    "reads_features": FLAG,
+    "reads_features": FLAG | NONE,
     "shift_pixels": ALGORITHM["shift_pixels"],
 }
 
@@ -65,10 +66,11 @@ RULES = {
 class ActorCriticOptions(LatentOptions):
     """
     As :class:`LatentOptions`; the target is a moving average, which actor and critics read, too. There is no Q head. By
-    default, the latent state is 72 unconstrained numbers, as many as SE(2) has in 12 blocks: docs/results/continuous.md.
+    default, the latent state is 72 numbers, as many as SE(2) has in 12 blocks, and κ(x, a) is added to them:
+    docs/results/continuous.md.
     """
 
-    group: str | Group = option("none(72)", GROUP)  # type: ignore[assignment]  # noqa: RUF009
+    group: str | Group = option("T(72)^1", GROUP)  # type: ignore[assignment]  # noqa: RUF009
     transition: str = option("group", one_of(["group"]))
     latent_tau: float | None = option(0.005, SHARE)
     projection: str = option("own", one_of(["own", "none"]))
@@ -95,15 +97,15 @@ class ActorCriticOptions(LatentOptions):
 
 class LatentReader(BaseFeaturesExtractor):
     """
-    What actor and critics read of observations: [s, h(s), x] of vectors, [h(s), x] of all others, or the same without h(s).
-    h and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In a round of
+    What actor and critics read of observations: [s, x] of vectors, [h(s), x] of all others, or as ``reads_features`` says. h
+    and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In a round of
     updates, observations are augmented, and those of one batch are encoded only once, for actor and critics alike.
 
     :param observation_space: of the observations
     :param encoder: the moving average of the encoder, h
     :param latent_model: the moving average of the latent model
     :param augment: in a round of updates; otherwise observations are only preprocessed
-    :param reads_features: whether h(s) is among what they read
+    :param reads_features: whether h(s) is among what they read; ``None``: unless s is
     """
 
     def __init__(
@@ -112,12 +114,12 @@ class LatentReader(BaseFeaturesExtractor):
         encoder: BaseFeaturesExtractor,
         latent_model: LatentModel,
         augment: Augmentation,
-        reads_features: bool = True,
+        reads_features: bool | None = None,
     ):
         self.is_vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
         n_observed = observation_space.shape[0] if self.is_vector else 0  # type: ignore[index]
-        self.reads_features = reads_features
-        n_features = encoder.features_dim if reads_features else 0
+        self.reads_features = not self.is_vector if reads_features is None else reads_features
+        n_features = encoder.features_dim if self.reads_features else 0
         super().__init__(observation_space, n_observed + n_features + latent_model.state_dim)
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
         self._augment = augment
@@ -220,7 +222,7 @@ class EqRActorCriticPolicy(BasePolicy):
         ``head_input="observation"``
     :param features_extractor_kwargs: its keyword arguments
     :param layer_norm: whether layer norm follows the encoder
-    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s
+    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s; ``None``: unless s is a vector
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
     :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
         (https://arxiv.org/abs/2004.13649)
@@ -251,7 +253,7 @@ class EqRActorCriticPolicy(BasePolicy):
         features_extractor_kwargs: dict[str, Any] | None = None,
         layer_norm: bool = True,
         head_input: str = "latent",
-        reads_features: bool = True,
+        reads_features: bool | None = None,
         shift_pixels: int = 4,
         **kwargs: Any,
     ):

@@ -58,7 +58,7 @@ class EqRSAC(EqRActorCritic, SAC):
         aet_coef: float = 1.0,
         symmetry_coef: float = 0.0,
         reward_coef: float = 1.0,
-        latent_batch_size: int | None = None,
+        latent_batch_size: int | None = 64,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,

@@ -152,7 +152,8 @@ def _generator(ax: Axes, part: Generators, k: int, drawn: dict[str, Any]) -> Non
     largest = np.argsort(-np.abs(part.mean[:, k]).sum(axis=0), kind="stable")[:MAX_COORDINATES]
     for i, c in enumerate(sorted(largest)):
         shift = (i - (len(largest) - 1) / 2) * 0.6 / max(len(largest), 2)  # so that bars do not hide each other
-        name = part.names[c] if len(largest) == len(part.names) else f"coordinate {i + 1} of the {MAX_COORDINATES} largest"
+        same = len(largest) == len(part.names) or part.mean.shape[1] == 1  # coordinates in all panels
+        name = part.names[c] if same else f"{i + 1} of the {MAX_COORDINATES} largest"
         style = (list(drawn).index(name) if name in drawn else len(drawn)) % len(MARKERS)  # the same in all panels
         x, looks = np.arange(len(part.mean)) + shift, {"color": COLORS[style], "markersize": 3, "elinewidth": 1}
         bars = ax.errorbar(x, part.mean[:, k, c], part.std[:, k, c], fmt=MARKERS[style], **looks)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ LATENT_SPACE: dict[str, list[Any]] = {
     "prediction_depth": [1, 2, 3, 5],
     "aet_coef": [0.1, 0.3, 1.0],
     "reward_coef": [0.0, 0.3, 1.0],
-    "group": ["SE(2)", "SO(3)", "GL(2)", "none(72)"],
+    "group": ["SE(2)", "SO(3)", "GL(2)", "T(72)^1"],
 }
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
 

@@ -107,7 +107,7 @@ def test_the_default_latent_state_has_as_many_numbers_as_twelve_blocks_of_se2(ag
 
 
 @EACH
-@pytest.mark.parametrize("reads_features", [False, True])
+@pytest.mark.parametrize("reads_features", [None, False, True])
 def test_actor_and_critics_read_the_moving_average(agent, reads_features):
     model = make(agent, policy_kwargs={"reads_features": reads_features}).learn(60)
     policy, observation = model.policy, th.rand(5, 3)
@@ -133,13 +133,20 @@ def test_actor_and_critics_read_the_moving_average(agent, reads_features):
 
 
 @EACH
+def test_features_are_read_where_the_observation_is_not(agent):
+    for env, policy, n_read in ((BOX, "MlpPolicy", 3), (IMAGE, "CnnPolicy", 64), (IMAGE, "MlpPolicy", 256)):
+        reader = make(agent, MoveEnv(env), policy).actor.features_extractor
+        assert reader.features_dim == n_read + 3 * 6, (env, policy)
+
+
+@EACH
 def test_the_gradient_for_the_action_passes_the_latent_model(agent):
     """Against central differences in float64."""
     model = make(agent).learn(60)
     policy = model.policy.double()
     critic, observation, action = policy.critic, th.rand(4, 3, dtype=th.float64), th.rand(4, 2, dtype=th.float64)
     features = policy.latent_encoder(observation)
-    read = th.cat([observation, features, policy.latent_target.embedding(features)], dim=1)
+    read = th.cat([observation, policy.latent_target.embedding(features)], dim=1)
     critic.features_extractor.forward = lambda obs: read  # as SB3 converts observations to float32
     action.requires_grad_()
 
@@ -379,7 +386,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
     make(agent, ent_coef=0.1).learn(30, callback=ExactCheckpointCallback(20, tmp_path))
     for other, why in (
         ({"ent_coef": 0.2}, "ent_coef = 0.1 there, 0.2"),
-        ({"latent_batch_size": 4}, "latent_batch_size = None there, 4"),
+        ({"latent_batch_size": 4}, "latent_batch_size = 64 there, 4"),
     ):
         with pytest.raises(ValueError, match=f"must be empty or hold checkpoints of this run, .*{why} here"):
             make(agent, **{"ent_coef": 0.1, **other}).learn(30, callback=ExactCheckpointCallback(20, tmp_path))
@@ -409,7 +416,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"policy_kwargs": {"n_block": 3}}, "unexpected argument 'n_block'. Did you mean 'n_blocks'"),
         ({"policy_kwargs": {"optimizer_class": "Adem"}}, "a name in torch.optim"),
         ({"policy_kwargs": {"projection": "head"}}, "projection must be one of"),
-        ({"batch_size": 1}, "batch_size must be an integer >= 2"),
+        ({"batch_size": 1, "latent_batch_size": None}, "batch_size must be an integer >= 2"),
         ({"policy_kwargs": {"optimizer_kwargs": 3}}, "optimizer_kwargs must be a dictionary"),
         ({"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn must be a class of torch.nn"),
         ({"policy_kwargs": {"net_arch": [0]}}, "net_arch must be a list of integers"),
