@@ -351,13 +351,11 @@ class EqRActorCriticPolicy(BasePolicy):
         return actions
 
     def set_training_mode(self, mode: bool) -> None:
-        """As SB3's, for the latent model, too; its moving average stays in eval mode."""
+        """As SB3's, for the latent model, too; its moving average is always in eval mode."""
         super().set_training_mode(mode)
         if self.has_latent:
             self.encoder.train(mode)
             self.latent_model.train(mode)
-            self.latent_encoder.eval()
-            self.latent_target.eval()
 
     def train(self, mode: bool = True) -> "EqRActorCriticPolicy":
         """As PyTorch's, but the moving average stays in eval mode."""

@@ -38,6 +38,9 @@ class GroupLayer(nn.Module):
     ):
         super().__init__()
         made = make_group(group, parameterization)
+        if isinstance(made, ProductGroup) and len(made.factors) == 1:  # "SE(2)^8": its blocks need not be split and joined
+            made, count = made.factors[0]
+            n_blocks = count * (n_blocks or 1)
         if n_blocks is None:
             n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
             n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
