@@ -21,9 +21,8 @@ from sb3_eqr.visualize import LatentCallback
 
 
 def pong() -> EqRAlgorithm:
-    """Atari 100K's settings."""
-    settings = load_configuration("eqr_qrdqn", learning_starts=100, buffer_size=2_000)
-    return EqRQRDQN("CnnPolicy", make_atari100k_env("Pong", seed=0), seed=0, **settings)
+    """Atari, the defaults."""
+    return EqRQRDQN("CnnPolicy", make_atari100k_env("Pong", seed=0), seed=0, learning_starts=100, buffer_size=2_000)
 
 
 def cartpole() -> EqRAlgorithm:

@@ -221,9 +221,9 @@ def main() -> None:
         seconds = args.minutes * 60 - EVALUATION_SECONDS - ANIMATION_SECONDS
         args.steps = steps_that_fit(args.config, args.width_scale, args.game, 0.9 * seconds)
         settings = {"learning_starts": SHORT_LEARNING_STARTS}
-    elif "exploration_fraction" in (config := load_configuration(args.config)):
+    if is_atari(game) and "exploration_fraction" in (config := load_configuration(args.config)):
         share = config["exploration_fraction"] * FULL_STEPS / args.steps  # the same number of steps
-        settings = {"exploration_fraction": min(share, 1.0)}
+        settings["exploration_fraction"] = min(share * settings.get("learning_starts", 2_000) / 2_000, 1.0)
     print(f"{args.config} on {args.game}: {args.steps} steps on {th.get_num_threads()} thread(s)", flush=True)
 
     model = make_model(args.config, args.width_scale, args.game, args.seed, **settings)

@@ -48,6 +48,7 @@ ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL 
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
 OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC}
+OTHERS["none_tqc"] = EqRTQC
 
 
 def first_version(group: str) -> dict[str, Any]:
@@ -62,6 +63,8 @@ ARMS: dict[str, dict[str, Any]] = {
     "eqr_sac": {},
     "no_losses": {"prediction_depth": 0},
     "none": first_version("none(72)"),
+    "none_tqc": first_version("none(72)"),
+    "none_no_losses": {**first_version("none(72)"), "prediction_depth": 0},
     "se2": first_version("SE(2)"),  # 12 blocks have as many numbers
     "t72": first_version("T(72)^1"),  # as many, without rotation
 }
@@ -210,7 +213,9 @@ def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[
     for path in paths:
         texts = [file.read_text() for file in sorted(path.glob("*.json"))] if path.is_dir() else lzma.open(path, "rt")
         for run in map(json.loads, texts):
-            runs.setdefault((run["task"], run["arm"]), {})[run["seed"]] = run
+            others = runs.setdefault((run["task"], run["arm"]), {})
+            if others.setdefault(run["seed"], run) != run:
+                raise ValueError(f"{path}: {run['arm']}, {run['task']}, seed {run['seed']}: another run was read before.")
     return runs
 
 
@@ -325,6 +330,8 @@ def main() -> None:
     if args.greedy:  # older runs were not evaluated
         runs = {key: {seed: run for seed, run in found.items() if "greedy" in run} for key, found in runs.items()}
         runs = {key: found for key, found in runs.items() if found}
+    if args.to not in (arms := sorted({arm for _, arm in runs})):
+        parser.error(f"--to must be one of {arms}, got {args.to!r}")
     if args.pack is not None:
         lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
         with atomic_write(args.pack, "xz") as out:

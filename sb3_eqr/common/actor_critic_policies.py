@@ -78,15 +78,20 @@ class ActorCriticOptions(LatentOptions):
     def __post_init__(self) -> None:
         if self.group is None:
             raise ValueError(
-                'group must be a string or a group, got None. Pass "none(72)" for an unconstrained latent state, or, for SAC '
-                'itself, prediction_depth=0 and policy_kwargs=dict(head_input="observation").'
+                'group must be a string or a group, got None. Omit it for the default, pass "none(72)" so that κ(x, a) is the '
+                'next state itself, or, for SAC itself, prediction_depth=0 and policy_kwargs=dict(head_input="observation").'
             )
         super().__post_init__()
+        if self.n_blocks is not None and isinstance(self.group, str) and "^" in self.group:
+            raise ValueError(
+                f"n_blocks must be None with group={self.group!r}, whose name has the number of blocks, got {self.n_blocks}. "
+                'Pass a group without it, such as group="SE(2)", too, or omit n_blocks.'
+            )
         if isinstance(self.group, str) and self.group.startswith("none"):
             if self.n_blocks not in (None, 1):
                 raise ValueError(
                     f"n_blocks must be None or 1 without a group, got {self.n_blocks}. "
-                    'Pass a group such as group="SE(2)", too, or another number of values such as group="none(72)".'
+                    'Pass a group such as group="SE(2)" in its place, or another number of values such as group="none(216)".'
                 )
             if not self.state_dependent_actions:
                 raise ValueError(
@@ -105,7 +110,7 @@ class LatentReader(BaseFeaturesExtractor):
     :param encoder: the moving average of the encoder, h
     :param latent_model: the moving average of the latent model
     :param augment: in a round of updates; otherwise observations are only preprocessed
-    :param reads_features: whether h(s) is among what they read; ``None``: unless s is
+    :param reads_features: whether h(s) is among what they read; ``None``: only if s is not a vector
     """
 
     def __init__(
@@ -222,7 +227,8 @@ class EqRActorCriticPolicy(BasePolicy):
         ``head_input="observation"``
     :param features_extractor_kwargs: its keyword arguments
     :param layer_norm: whether layer norm follows the encoder
-    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s; ``None``: unless s is a vector
+    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s; ``None``: only if s is
+        not a vector
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
     :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
         (https://arxiv.org/abs/2004.13649)

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from torch.utils.data import default_collate
 
 from sb3_eqr.common.checks.arguments import check, integer
-from sb3_eqr.common.groups import SE, SO, Group, NoGroup
+from sb3_eqr.common.groups import SE, SO, Group, NoGroup, T
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.common.saving.files import atomic_write
 from sb3_eqr.common.saving.random_state import preserved_rng_state
@@ -157,7 +157,7 @@ def panel(name: str, group: Group, elements: th.Tensor) -> Panel:
         half_width = (1.0 if is_rotation else _extent(images)) / (ROOM if vector is None else ARROW)
         arrows[:, :, : images.shape[2]] = images / half_width
     if vector is not None:
-        if isinstance(group, NoGroup) and n > 2:  # principal axes
+        if (isinstance(group, NoGroup) and n > 2) or (isinstance(group, T) and n > 3):  # principal axes
             plane = np.linalg.svd(vector[0] - vector[0].mean(axis=0), full_matrices=False)[2][:2].T
         dots = vector @ plane
         dots -= (dots[0].min(axis=0) + dots[0].max(axis=0)) / 2

@@ -91,7 +91,7 @@ def make_env(
     elif env_id.startswith("ALE/") or "NoFrameskip" in env_id:
         if kwargs:
             raise ValueError(f"--env-kwargs must be empty for Atari, whose protocol is fixed, got {kwargs}.")
-        env = make_atari100k_env(env_id, n_envs, seed, training=True)
+        env = make_atari100k_env(env_id, n_envs, seed, training=True, render_mode="rgb_array" if render else None)
     else:
         env = _plain_env(env_id, kwargs, n_envs, seed, render)
     statistics = path.parent / "vecnormalize.pkl"

@@ -107,6 +107,14 @@ def test_the_default_latent_state_has_as_many_numbers_as_twelve_blocks_of_se2(ag
 
 
 @EACH
+def test_by_default_the_element_of_the_action_is_added(agent):
+    latent = agent("MlpPolicy", "Pendulum-v1", **SMALL).policy.latent_model
+    state, action = th.rand(4, 72), th.rand(4, 1)
+    element = latent.transition(th.cat([state, action], dim=1))
+    assert th.equal(latent.act(latent.action_element(state, action), state), state + element)
+
+
+@EACH
 @pytest.mark.parametrize("reads_features", [None, False, True])
 def test_actor_and_critics_read_the_moving_average(agent, reads_features):
     model = make(agent, policy_kwargs={"reads_features": reads_features}).learn(60)
@@ -134,9 +142,10 @@ def test_actor_and_critics_read_the_moving_average(agent, reads_features):
 
 @EACH
 def test_features_are_read_where_the_observation_is_not(agent):
-    for env, policy, n_read in ((BOX, "MlpPolicy", 3), (IMAGE, "CnnPolicy", 64), (IMAGE, "MlpPolicy", 256)):
-        reader = make(agent, MoveEnv(env), policy).actor.features_extractor
-        assert reader.features_dim == n_read + 3 * 6, (env, policy)
+    for env, kind in ((BOX, "MlpPolicy"), (IMAGE, "CnnPolicy"), (IMAGE, "MlpPolicy"), (DICT, "MultiInputPolicy")):
+        policy = make(agent, MoveEnv(env), kind).policy
+        n_read = 3 if env is BOX else policy.encoder.features_dim
+        assert policy.actor.features_extractor.features_dim == n_read + 3 * 6, (env, kind)
 
 
 @EACH
@@ -354,10 +363,11 @@ def test_one_update_by_hand(agent, n_windows):
         ("MlpPolicy", MoveEnv, {"use_sde": True, "train_freq": (1, "episode"), "gradient_steps": -1}),
         ("MlpPolicy", MoveEnv, {"symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(3)"}}),
         ("MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "none", "n_blocks": None}}),
+        ("MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "T(72)^1", "n_blocks": None}}),
         ("CnnPolicy", lambda: VecFrameStack(make_vec_env(lambda: MoveEnv(IMAGE), 2), 4), {}),
         ("MultiInputPolicy", lambda: MoveEnv(DICT), {}),
     ],
-    ids=["normalised", "noise", "sde", "GET", "no group", "images", "dicts"],
+    ids=["normalised", "noise", "sde", "GET", "no group", "default group", "images", "dicts"],
 )
 def test_a_run_is_repeatable_and_can_be_saved(agent, policy, make_env, kwargs, tmp_path):
     first, second = (make(agent, make_env(), policy, **kwargs).learn(60) for _ in range(2))
@@ -399,6 +409,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"policy_kwargs": {"head_input": "observation"}}, "prediction_depth must be 0 with head_input='observation'"),
         ({"policy_kwargs": {"head_input": "trunk"}}, "head_input must be one of .*'latent', 'observation'.*, got 'trunk'"),
         ({"policy_kwargs": {"group": None}}, "group must be"),
+        ({"policy_kwargs": {"group": "T(72)^1", "n_blocks": 3}}, "n_blocks must be None with group='T"),
         ({"policy_kwargs": {"group": "none(72)", "n_blocks": 3}}, "n_blocks must be None or 1 without a group, got 3"),
         (
             {"policy_kwargs": {"group": "none", "n_blocks": None, "state_dependent_actions": False}},
@@ -511,6 +522,9 @@ def test_outside_of_updates_images_are_not_shifted(agent):
 @EACH
 def test_the_average_stays_in_eval_mode(agent):
     policy = make(agent).learn(60).policy.train()
+    assert policy.latent_model.training and not (policy.latent_encoder.training or policy.latent_target.training)
+    policy.set_training_mode(False)
+    policy.set_training_mode(True)
     assert policy.latent_model.training and not (policy.latent_encoder.training or policy.latent_target.training)
 
 

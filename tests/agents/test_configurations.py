@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch as th
+import yaml
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -17,7 +18,7 @@ from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.common.networks.encoders import ImpalaTrunk, NormalizedExtractor
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
-from sb3_eqr.configurations import configuration_files, merged, with_schedule
+from sb3_eqr.configurations import ZOO_KEYS, configuration_files, merged, with_schedule
 from tests.models import all_finite
 from tests.toys import ImageEnv
 
@@ -191,6 +192,19 @@ def test_eqr_bbf_follows_the_papers_recipe():
     assert model.policy.act_with_target and model.double_q
 
 
+def test_the_python_defaults_are_those_of_our_first_runs():
+    """Their file has every value; settings/atari builds on the defaults."""
+    env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
+    default = EqRRainbow("CnnPolicy", env, gradient_steps=1)
+    default._setup_learn(100_000, None)  # learning_starts follows the length of the run
+    entry = yaml.safe_load((ROOT / "experiments" / "settings" / "atari100k" / "defaults.yml").read_text())["atari"]
+    written = {key: value for key, value in entry.items() if key not in (*ZOO_KEYS, "callback")}
+    written |= written.pop("replay_buffer_kwargs") | written.pop("policy_kwargs")
+    found = {**vars(default.replay_buffer), **vars(default.policy), **vars(default.policy.options), **vars(default)}
+    found |= {"train_freq": default.train_freq.frequency, "n_blocks": default.policy.latent_model.n_blocks}
+    assert {key: found[key] for key in written} == written
+
+
 def test_atari_has_the_recipe_of_our_runs():
     """The plan of those runs has its own file, older than they are, which repeats three defaults."""
     protocol = load_suite("atari100k").protocol("Boxing")
@@ -198,6 +212,7 @@ def test_atari_has_the_recipe_of_our_runs():
     recipe, planned = (hyperparameters(agent, protocol, spaces.Discrete(6)) for agent in agents)
     repeated = {"prediction_depth": 5, "symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(2)"}}
     assert merged(repeated, recipe) == planned
+    assert load_configuration("eqr_qrdqn") == load_configuration("eqr_rainbow")
 
 
 @pytest.mark.parametrize("path", configuration_files().values(), ids=lambda path: path.stem)

@@ -106,10 +106,11 @@ def test_a_panel_grows_for_predictions_except_outliers():
     np.testing.assert_array_equal(beyond.dots[1], [[-1, 0], [1, 0]])  # at the edge
 
 
-def test_without_a_group_two_principal_components_are_drawn():
+@pytest.mark.parametrize("group", ["none(4)", "T(4)"])
+def test_of_many_numbers_two_principal_components_are_drawn(group):
     t = th.linspace(-1, 1, 9)
     vectors = th.outer(t, th.tensor([0.0, 3.0, 4.0, 0.0])) + th.tensor([7.0, 7.0, 7.0, 7.0])
-    dots = panel("1", make_group("none(4)"), th.stack([vectors, vectors])).dots[0]
+    dots = panel("1", make_group(group), th.stack([vectors, vectors])).dots[0]
     np.testing.assert_allclose(dots * np.sign(dots[-1, 0]), np.stack([t * ROOM, 0 * t], axis=1), atol=1e-6)
 
 

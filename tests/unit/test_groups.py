@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_eqr.common.groups import SO, MatrixLieGroup, guarded_inverse, make_group
+from sb3_eqr.common.groups import SE, SO, GroupLayer, MatrixLieGroup, guarded_inverse, make_group
 from sb3_eqr.common.groups.matrix import euler_rotation, exp_rotation
 from sb3_eqr.common.saving.plain_data import encode
 
@@ -285,3 +285,11 @@ def test_generators_are_copied():
     found[0, 0].backward()
     assert found[0, 0].item() == pytest.approx(np.cos(0.5), rel=1e-4)
     assert angle.grad.item() == pytest.approx(-np.sin(0.5), rel=1e-4)
+
+
+def test_a_product_of_one_factor_is_that_group():
+    layer, params = GroupLayer(4, "SE(2)^8"), th.randn(5, 8, 3)
+    assert isinstance(layer.group, SE) and (layer.n_blocks, layer.state_dim) == (8, 48)
+    assert layer.description == GroupLayer(4, "SE(2)", 8).description
+    product = make_group("SE(2)^8").element(params.flatten(1))
+    assert th.equal(layer.group.element(params).flatten(1), product)

@@ -319,7 +319,8 @@ def check_same_parameters(expected: dict[str, str], found: dict[str, str]) -> No
         if found.get(name, expected[name]) != expected[name]:
             raise ValueError(
                 f"{name}: parameters must be for {expected[name]!r}, got parameters for {found[name]!r}. "
-                "Build the model with the policy_kwargs and observations of the file, or use load(), which does so."
+                "Build the model with the policy_kwargs and observations of the file, or use load(), which does so, "
+                "unless the file is of a version with other defaults."
             )
 
 

@@ -21,7 +21,7 @@ class GroupLayer(nn.Module):
     :param features_dim: F
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
     :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the name contains the number of blocks
-        ("SE(2)^8 x SO(3)^4") or is "none"
+        ("SE(2)^8 x SO(3)^4"), which K multiplies, or is "none"
     :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether to whiten the algebra parameters over the batch
         (:class:`~sb3_eqr.common.groups.layer.Whitening`): states cannot collapse to a point, and blocks are decorrelated
@@ -38,7 +38,7 @@ class GroupLayer(nn.Module):
     ):
         super().__init__()
         made = make_group(group, parameterization)
-        if isinstance(made, ProductGroup) and len(made.factors) == 1:  # "SE(2)^8": its blocks need not be split and joined
+        if type(made) is ProductGroup and len(made.factors) == 1:  # "SE(2)^8": its blocks need not be split and joined
             made, count = made.factors[0]
             n_blocks = count * (n_blocks or 1)
         if n_blocks is None:
