@@ -116,7 +116,7 @@ def main() -> None:
     """Parse the command line, measure, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--games", nargs="+", default=["Krull", "Pong", "MsPacman", "Boxing"])
-    parser.add_argument("--configurations", nargs="+", default=["paper", *CHANGES])
+    parser.add_argument("--configurations", nargs="+", default=["paper", "eqr_rainbow", *CHANGES])
     parser.add_argument("--updates", type=int, default=90, help="for the gradients")
     parser.add_argument("--later", type=int, default=500, help="updates before spread and skill are measured; 0: not")
     parser.add_argument("--frames", type=int, default=1_000, help="frames of random actions to train on")
