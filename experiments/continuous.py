@@ -304,9 +304,8 @@ def main() -> None:
     commands.add_parser("still", help="print the returns of the action 0")
     reporting = commands.add_parser("report", help="print the table")
     reporting.add_argument("paths", nargs="+", type=pathlib.Path, help="folders of train, or packed files")
-    reporting.add_argument(
-        "--figure", type=pathlib.Path, help="also draw the returns of sac and eqr_sac in training into this file"
-    )
+    reporting.add_argument("--figure", type=pathlib.Path, help="also draw the returns of --drawn and sac into this file")
+    reporting.add_argument("--drawn", default="eqr_sac", help="an arm of EqRSAC")
     reporting.add_argument("--to", default="sac", help="the arm whose area is 1")
     reporting.add_argument("--after", type=int, default=0, help="count episodes that end after this step")
     reporting.add_argument("--until", type=int, default=N_STEPS, help="count episodes that end until this step")
@@ -337,7 +336,7 @@ def main() -> None:
         with atomic_write(args.pack, "xz") as out:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
-        draw(rows(runs, ["eqr_sac", "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
+        draw(rows(runs, [args.drawn, "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
     print(report(runs, args.to, args.after, args.cost, args.until, args.greedy))
 
 
