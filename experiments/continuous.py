@@ -208,14 +208,12 @@ def still(n_episodes: int = 20) -> str:
 
 
 def read(paths: Sequence[pathlib.Path]) -> dict[tuple[str, str], dict[int, dict[str, Any]]]:
-    """Runs by seed by (task, arm), from folders of ``train`` and packed files."""
+    """Runs by seed by (task, arm), from folders of ``train`` and packed files; of equal names, the last one."""
     runs: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
     for path in paths:
         texts = [file.read_text() for file in sorted(path.glob("*.json"))] if path.is_dir() else lzma.open(path, "rt")
         for run in map(json.loads, texts):
-            others = runs.setdefault((run["task"], run["arm"]), {})
-            if others.setdefault(run["seed"], run) != run:
-                raise ValueError(f"{path}: {run['arm']}, {run['task']}, seed {run['seed']}: another run was read before.")
+            runs.setdefault((run["task"], run["arm"]), {})[run["seed"]] = run
     return runs
 
 
