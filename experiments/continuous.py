@@ -47,8 +47,10 @@ N_STEPS, N_SHORT, N_RANDOM_SHORT, N_BETWEEN, N_GREEDY = 100_000, 12_000, 2_000, 
 ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL Zoo's; the rest are SB3's defaults
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
-OTHERS = {"sac": SAC, "sac_layer_norm": SAC, "sac_two_updates": SAC, "tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC}
-OTHERS["none_tqc"] = EqRTQC
+OTHERS = {
+    **dict.fromkeys(("sac", "sac_layer_norm", "sac_two_updates"), SAC),
+    **{"tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC, "none_tqc": EqRTQC},
+}
 
 
 def first_version(group: str) -> dict[str, Any]:
