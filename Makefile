@@ -34,7 +34,7 @@ quick: $(VENV)/installed
 	$(BIN)/python -m pytest tests/unit
 
 pytest: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 slow: $(VENV)/installed
 	$(BIN)/python -m pytest -m slow

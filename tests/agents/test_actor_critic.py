@@ -80,8 +80,8 @@ def make(agent, env=None, policy="MlpPolicy", **kwargs):
     ids=["default", "n steps", "episodes", "sde"],
 )
 def test_without_latent_model_all_parameters_are_those_of_the_stock_agent(agent, stock, kwargs):
-    ours = agent("MlpPolicy", MoveEnv(), **SMALL, **kwargs, **OFF).learn(90)
-    theirs = stock("MlpPolicy", MoveEnv(), **SMALL, **kwargs, policy_kwargs={"net_arch": [16]}).learn(90)
+    ours = agent("MlpPolicy", MoveEnv(), **SMALL, **kwargs, **OFF).learn(60)
+    theirs = stock("MlpPolicy", MoveEnv(), **SMALL, **kwargs, policy_kwargs={"net_arch": [16]}).learn(60)
     assert ours._n_updates == theirs._n_updates > 0
     assert same(ours, theirs)
 
@@ -370,7 +370,7 @@ def test_one_update_by_hand(agent, n_windows):
     ids=["normalised", "noise", "sde", "GET", "no group", "default group", "images", "dicts"],
 )
 def test_a_run_is_repeatable_and_can_be_saved(agent, policy, make_env, kwargs, tmp_path):
-    first, second = (make(agent, make_env(), policy, **kwargs).learn(60) for _ in range(2))
+    first, second = (make(agent, make_env(), policy, **kwargs).learn(52) for _ in range(2))
     assert first._n_updates > 10 and same(first, second)
     assert all(th.isfinite(value).all() for value in tensors(first).values())
     first.save(tmp_path / "model")
@@ -383,11 +383,11 @@ def test_a_run_is_repeatable_and_can_be_saved(agent, policy, make_env, kwargs, t
 
 @pytest.mark.parametrize("agent, env", [(EqRSAC, "Pendulum-v1"), (EqRTQC, "MountainCarContinuous-v0")])
 def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
-    whole = make(agent, env).learn(120)
-    make(agent, env).learn(90, callback=ExactCheckpointCallback(60, tmp_path))
+    whole = make(agent, env).learn(90)
+    make(agent, env).learn(70, callback=ExactCheckpointCallback(60, tmp_path))
     resumed = agent.resume(tmp_path, make(agent, env).get_env())
     assert resumed.num_timesteps == 60
-    resumed.learn(60, reset_num_timesteps=False)
+    resumed.learn(30, reset_num_timesteps=False)
     assert same(whole, resumed)
 
 

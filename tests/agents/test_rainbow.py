@@ -223,15 +223,15 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
 
 def test_when_resets_happen(make):
     """As in BBF, only if a full interval of updates is left after the reset."""
-    model = make(ChainEnv(), resets={"interval": 12}).learn(90)  # 100 updates in steps 41 to 90, two per step
-    assert model._n_updates == 100
-    assert model._resets.done == [12, 24, 36, 48, 60, 72, 84]  # after 84, 16 are left; after 96, 4
-    assert make(ChainEnv(), resets={"interval": 50}).learn(90)._resets.done == [50]  # after which 50 are left
-    within_rounds = make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(60)
-    assert within_rounds._resets.done == [7, 14, 21, 28, 35, 42, 49]
-    postponed = make(ChainEnv(), resets={"interval": 30}).learn(60)  # it is due in the last tenth of the call of learn
-    assert (postponed._n_updates, postponed._resets.done) == (40, [])
-    assert postponed.learn(40, reset_num_timesteps=False)._resets.done == [40, 70]
+    model = make(ChainEnv(), resets={"interval": 6}).learn(65)  # 50 updates in steps 41 to 65, two per step
+    assert model._n_updates == 50
+    assert model._resets.done == [6, 12, 18, 24, 30, 36, 42]  # after 42, 8 are left; after 48, 2
+    assert make(ChainEnv(), resets={"interval": 25}).learn(65)._resets.done == [25]  # after which 25 are left
+    within_rounds = make(ChainEnv(), resets={"interval": 7}, gradient_steps=3).learn(50)
+    assert within_rounds._resets.done == [7, 14, 21]
+    postponed = make(ChainEnv(), resets={"interval": 15}).learn(50)  # too few updates are left in this call of learn
+    assert (postponed._n_updates, postponed._resets.done) == (20, [])
+    assert postponed.learn(20, reset_num_timesteps=False)._resets.done == [20, 35]
 
 
 def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):

@@ -77,7 +77,7 @@ def test_every_policy_runs_and_all_parameters_are_trained(make, policy, env, net
     ids=lambda kwargs: re.sub(" at 0x\\w+", "", str(kwargs)),
 )
 def test_every_option_runs_and_is_saved(make, kwargs, tmp_path):
-    model = make(ChainEnv(), **kwargs).learn(62)
+    model = make(ChainEnv(), **kwargs).learn(52)
     assert model._n_updates > 0 and all_finite(model)
     model.save(tmp_path / "model")
     loaded = make.algorithm.load(tmp_path / "model", ChainEnv(), trust=True)

@@ -228,18 +228,18 @@ def test_the_trunk_does_not_grow_in_the_first_updates():
 
 
 def test_frames_stay_different_in_the_first_updates():
-    """Without centring, the TD loss makes the features of all frames of Pong alike within 100 updates."""
+    """Without centring, the TD loss makes the features of all frames of Pong alike within 60 updates."""
     spreads = {}
     for center in (True, False):
         settings = {"buffer_size": 300, "learning_starts": 200, "seed": 0, "prediction_depth": 0}
         policy_kwargs = {"center": center, "group": None}
         model = EqRRainbow("CnnPolicy", make_atari100k_env("Pong", seed=0), **settings, policy_kwargs=policy_kwargs)
-        model.learn(200).train(100, 16)
+        model.learn(200).train(60, 16)
         model.policy.set_training_mode(False)
         with th.no_grad():
             features = model.policy.online.features(model.replay_buffer.sample(64).observations)
         spreads[center] = (features.var(dim=0, correction=0).sum().sqrt() / features.norm(dim=1).mean()).item()
-    assert spreads[True] > 0.1 > 2 * spreads[False]
+    assert spreads[True] > 0.2 > 2 * spreads[False]
 
 
 @pytest.mark.parametrize("n_copies, n_averages", [pytest.param(150, 50, marks=pytest.mark.slow), (0, 50)])

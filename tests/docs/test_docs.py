@@ -37,6 +37,7 @@ from sybil.evaluators.python import PythonEvaluator
 from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import sb3_eqr.envs.atari
+import sb3_eqr.visualize
 import sb3_eqr.zoo.__main__ as zoo_command
 import sb3_eqr.zoo.hub
 from sb3_eqr import ExactCheckpointCallback, cli
@@ -290,6 +291,11 @@ def shortened(monkeypatch, tmp_path):
         begin(self, *args, **kwargs)
         self.save_freq = min(self.save_freq, STEPS // 2)
 
+    def record_briefly(*args, **kwargs):
+        return record(*args, **{**kwargs, "n_steps": 10})
+
+    record = sb3_eqr.visualize.record
+    monkeypatch.setattr(sb3_eqr.visualize, "record", record_briefly)
     setup_model, begin = OnPolicyAlgorithm._setup_model, ExactCheckpointCallback.__init__
     monkeypatch.setattr(ExactCheckpointCallback, "__init__", check_often)
     monkeypatch.setattr(BaseAlgorithm, "_setup_learn", setup_short_learn)
