@@ -8,6 +8,7 @@ folders of a benchmark or files of packed runs.
     python -m experiments.tables docs/results/atari100k/gpu.jsonl.xz --games Boxing --measures 0-20000 20000-40000
     python -m experiments.tables docs/results/first_page.jsonl.xz --agents aet_5 plain --figure goals distractors.png
     python -m experiments.tables docs/results --differences differences.png
+    python -m experiments.tables docs/results/atari100k/recipes.jsonl.xz --claim slow_target_eqr slow_target
     python -m experiments.tables --published
 
 Cells are means ± standard errors over seeds, with ``--each`` the seeds themselves. With ``--baseline`` they also have the
@@ -39,6 +40,7 @@ from sb3_eqr.plot_style import COLORS, GREY, looks, styled
 Row = dict[str, Any]
 Arguments = tuple[str, list[str], list[str], tuple[str, str], str, str]  # of ``compare``
 PARTS = 10  # of a run, for the return at its end and for figures
+SPR = "SPR (rliable, 100 runs)"  # in reference_scores.csv
 WIDTH, DPI = 3.9, 200  # of figures, in inches and dots per inch
 AXES = {
     "score": "mean score of the evaluation episodes",
@@ -368,6 +370,35 @@ def differences(found: list[Compared]) -> str:
     return re.sub(r" ?\| ?", "|", markdown(header, lines))
 
 
+def claim(rows: list[Row], agents: tuple[str, str], games: list[str]) -> str:
+    """
+    The endpoint of ``experiments/settings/atari``: differences in standard deviations of 100 published runs of SPR, and their
+    mean over games with its 95% interval (Student's t over games). Where a run was stopped, both agents' games in training
+    from step 55,000 to 75,000 are compared.
+
+    :param agents: with EqR and without it
+    :return: Markdown, a row per game that both have, the mean last
+    """
+    reference = load_reference()
+    spreads = reference[reference["method"] == SPR].set_index("game")["sd"]
+    lines, found = [], []
+    for game in games:
+        of_game = [[row for row in rows if (row["agent"], row["game"]) == (agent, game)] for agent in agents]
+        if not all(of_game):
+            continue
+        values = [np.array([measure(row, "score") for row in runs]) for runs in of_game]
+        if is_stopped := bool(np.isnan(np.concatenate(values)).any()):
+            values = [np.array([measure(row, "55000-75000") for row in runs]) for runs in of_game]
+        means, spread = [float(one.mean()) for one in values], float(spreads[game.lower()])
+        found.append((means[0] - means[1]) / spread)
+        measured = "training" if is_stopped else "final"
+        lines.append([game, measured, str(min(map(len, values))), *map(text, (*means, spread, found[-1]))])
+    half = student.ppf(0.975, len(found) - 1) * np.std(found, ddof=1) / np.sqrt(len(found)) if len(found) > 1 else np.nan
+    mean = float(np.mean(found))
+    lines.append(["mean", "", "", "", "", "", f"{text(mean)} [{text(mean - half)}, {text(mean + half)}]"])
+    return markdown(["game", "games", "seeds", "with EqR", "without", "SD of SPR", "difference in these"], lines)
+
+
 def published() -> str:
     """:return: Markdown: the last rows of the EqR paper's tables, computed from their scores of games, each agent once"""
     scores = load_reference().pivot(index="game", columns="method", values="mean")
@@ -405,6 +436,8 @@ def main() -> None:
     parser.add_argument("--labels", nargs="+", help="of the agents in the figure, in words")
     every = "a file: draw what EqR changes on every task of COMPARED, whose runs are in the given folder, and print a table"
     parser.add_argument("--differences", type=pathlib.Path, metavar="FILE", help=every)
+    units = "print the difference of two agents in units of SPR's published standard deviation, game by game"
+    parser.add_argument("--claim", nargs=2, metavar=("WITH", "WITHOUT"), help=units)
     parser.add_argument("--published", action="store_true", help="print the last rows of the paper's tables")
     args = parser.parse_args()
     if args.published:
@@ -426,7 +459,9 @@ def main() -> None:
         parser.error(f"no run of these agents, games and seeds; agents are {', '.join(sorted(set(full.values())))}")
     if args.agents:
         rows.sort(key=lambda row: wanted.index(row["agent"]))
-    if args.figure:
+    if args.claim:
+        print(claim(rows, (full[args.claim[0]], full[args.claim[1]]), args.games or unique(rows, "game")))
+    elif args.figure:
         draw(rows, args.figure[0], pathlib.Path(args.figure[1]), args.labels)
     else:
         print(table(rows, args.measures, full.get(args.baseline, args.baseline), args.ratio, args.each))

@@ -11,6 +11,7 @@ from scipy.stats import t
 from experiments.tables import (
     COMPARED,
     Compared,
+    claim,
     compare,
     difference,
     differences,
@@ -51,6 +52,21 @@ def test_series_are_tenths_of_the_run():
     assert steps.tolist() == [*range(10, 101, 10)] and goals.tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
     assert series(row(), "return")[1][[0, 2]].tolist() == [0.0, 2.0] and np.isnan(series(row(), "td_loss")[1]).all()
     assert [values.tolist() for values in series(row(), "score")] == [[50, 100], [9.0, 1.0]]
+
+
+def test_the_claim_is_in_standard_deviations_of_published_runs():
+    """SPR's are 464.7 on Krull and 55.35 on Assault (reference_scores.csv); differences of 1 and -2 of these."""
+    krull, assault = [row("a", "Krull", score=3464.7), row("b", "Krull", score=3000.0)], []
+    for agent, score in (("a", 589.3), ("b", 700.0)):  # in training, because one of the runs was stopped
+        games = {"step": [50_000, 60_000, 75_000], "score": [0.0, score - 9, score + 9], "length": [1, 1, 1]}
+        assault.append(row(agent, "Assault", training=games, **({"stopped_at": 75_010} if agent == "a" else {})))
+    lines = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in claim(krull + assault, ("a", "b"), ["Krull", "Assault"]).splitlines()[2:]
+    ]
+    assert [line[1:3] + line[-1:] for line in lines[:2]] == [["final", "1", "1.00"], ["training", "1", "-2.00"]]
+    half = t.ppf(0.975, 1) * 1.5  # the standard deviation of 1 and -2 is 2.121, by the root of 2
+    assert lines[2][-1] == f"-0.50 [{-0.5 - half:.1f}, {half - 0.5:.1f}]"
 
 
 def test_differences_have_welch_intervals():
