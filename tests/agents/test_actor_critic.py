@@ -354,18 +354,22 @@ def test_one_update_by_hand(agent, n_windows):
         assert th.allclose(after[average], 0.995 * before[average] + 0.005 * after[name], atol=1e-7), name
 
 
-@EACH
 @pytest.mark.parametrize(
-    "policy, make_env, kwargs",
+    "agent, policy, make_env, kwargs",
     [
-        ("MlpPolicy", lambda: VecNormalize(make_vec_env(MoveEnv, 2, seed=0)), {"n_steps": 3}),
-        ("MlpPolicy", MoveEnv, {"action_noise": NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)), "ent_coef": "auto_0.1"}),
-        ("MlpPolicy", MoveEnv, {"use_sde": True, "train_freq": (1, "episode"), "gradient_steps": -1}),
-        ("MlpPolicy", MoveEnv, {"symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(3)"}}),
-        ("MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "none", "n_blocks": None}}),
-        ("MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "T(72)^1", "n_blocks": None}}),
-        ("CnnPolicy", lambda: VecFrameStack(make_vec_env(lambda: MoveEnv(IMAGE), 2), 4), {}),
-        ("MultiInputPolicy", lambda: MoveEnv(DICT), {}),
+        (EqRSAC, "MlpPolicy", lambda: VecNormalize(make_vec_env(MoveEnv, 2, seed=0)), {"n_steps": 3}),
+        (
+            EqRTQC,
+            "MlpPolicy",
+            MoveEnv,
+            {"action_noise": NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)), "ent_coef": "auto_0.1"},
+        ),
+        (EqRTQC, "MlpPolicy", MoveEnv, {"use_sde": True, "train_freq": (1, "episode"), "gradient_steps": -1}),
+        (EqRSAC, "MlpPolicy", MoveEnv, {"symmetry_coef": 1.0, "policy_kwargs": {"group": "SE(3)"}}),
+        (EqRSAC, "MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "none", "n_blocks": None}}),
+        (EqRTQC, "MlpPolicy", MoveEnv, {"policy_kwargs": {"group": "T(72)^1", "n_blocks": None}}),
+        (EqRSAC, "CnnPolicy", lambda: VecFrameStack(make_vec_env(lambda: MoveEnv(IMAGE), 2), 4), {}),
+        (EqRTQC, "MultiInputPolicy", lambda: MoveEnv(DICT), {}),
     ],
     ids=["normalised", "noise", "sde", "GET", "no group", "default group", "images", "dicts"],
 )

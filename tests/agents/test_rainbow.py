@@ -13,7 +13,7 @@ from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, Imp
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
-from tests.models import MAKERS, PAPER, all_finite, loss_terms, same, tensors, untrained
+from tests.models import EITHER, MAKERS, PAPER, all_finite, loss_terms, same, tensors, untrained
 from tests.toys import ChainEnv, ImageEnv
 
 make_rainbow = MAKERS[1]
@@ -221,6 +221,7 @@ def test_a_reset_bit_for_bit(make, alpha, projection):
     assert untrained(model, before) == [] and all_finite(model)
 
 
+@EITHER
 def test_when_resets_happen(make):
     """As in BBF, only if a full interval of updates is left after the reset."""
     model = make(ChainEnv(), resets={"interval": 6}).learn(65)  # 50 updates in steps 41 to 65, two per step

@@ -133,6 +133,7 @@ def test_learning_starts_after_a_tenth_of_the_first_run_and_at_most_2000_steps(m
     assert model.learning_starts == expected
 
 
+@EITHER
 def test_the_last_table_has_the_updates_after_the_last_episode(make, tmp_path):
     model = make(ChainEnv(), "MlpPolicy", learning_starts=20)
     model.set_logger(configure(str(tmp_path), ["csv"]))
@@ -197,6 +198,7 @@ def test_an_extractor_derived_from_ours_may_have_its_own_arguments(make, group):
     assert model.predict(model.get_env().reset())[0].shape == (1,)
 
 
+@EITHER
 @BOTH
 def test_a_custom_extractor_becomes_the_trunk(make, network):
     kwargs = {"features_extractor_class": TinyExtractor, "features_extractor_kwargs": {"features_dim": 7}}
@@ -288,9 +290,10 @@ def test_train_mode_applies_to_the_trained_networks_only(make):
         assert not any(m.training for m in [*policy.target.modules(), *policy.latent_target.modules()])
 
 
+@EITHER
 @BOTH
 def test_target_networks_follow_the_online_ones(make, network):
-    policy = make(ChainEnv(), policy_kwargs=network).learn(80).policy
+    policy = make(ChainEnv(), policy_kwargs=network).learn(60).policy
     pairs = policy.target_copy.pairs
     if network is PAPER:
         assert len(pairs) == 2 and policy.latent_target_copy is policy.target_copy  # network, latent model
@@ -419,6 +422,7 @@ def test_predict_shapes(make):
         model.predict(ChainEnv().reset())
 
 
+@EITHER
 def test_eval_and_checkpoint_callbacks(make, tmp_path):
     """EvalCallback calls logger.dump, which also writes what training has recorded, as with QRDQN."""
     eval_env = VecNormalize(make_vec_env(ChainEnv), training=False)

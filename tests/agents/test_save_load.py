@@ -30,6 +30,7 @@ def same_moments(*models):
     return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
 
 
+@EITHER
 @POLICIES
 @pytest.mark.parametrize("switches", [{}, {"policy_kwargs": {"noisy": False, "dueling": False}, "prediction_depth": 0}])
 def test_save_and_load(make, policy, env, switches, tmp_path):

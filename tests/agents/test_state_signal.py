@@ -52,9 +52,8 @@ def test_a_head_on_the_trunk_needs_its_own_projection():
         EqRRainbow("MlpPolicy", ChainEnv(), policy_kwargs={"projection": "head"})
 
 
-@pytest.mark.parametrize("kind", [EqRRainbow, EqRQRDQN])
 @pytest.mark.parametrize("share", [None, 0.02])
-@pytest.mark.parametrize("head_input, double_q", [("state", True), ("trunk", False)])
+@pytest.mark.parametrize("kind, head_input, double_q", [(EqRRainbow, "state", True), (EqRQRDQN, "trunk", False)])
 def test_the_encoder_gets_no_more_of_the_auxiliary_gradient_than_its_share(kind, share, head_input, double_q):
     """Computed loss by loss: each one gives its gradient at the state and at the encoder's weights."""
     settings = {"aux_gradient_share": share, "symmetry_coef": 0.0}  # the only loss that samples partners

@@ -179,6 +179,7 @@ def test_the_loss_is_the_weighted_mean_of_its_terms(make):
     th.testing.assert_close(loss, (samples.weights * expected).mean())
 
 
+@EITHER
 @pytest.mark.parametrize("name", ["td", "aet", "symmetry", "reward"])
 def test_a_loss_with_weight_0_is_not_computed(make, name):
     model = trained_model(make)
