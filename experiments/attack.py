@@ -1,5 +1,5 @@
 """
-Attacks on the package: kills, wrong and hostile input, NaN, damaged files, a full disk, threads. Prints a row per test.
+Attacks on the package: kills, wrong input, hostile files, a full disk. Prints a row per test.
 
     python -m experiments.attack                       # all, about a quarter of an hour
     python -m experiments.attack --only inputs files --kills 20
@@ -17,15 +17,14 @@ from functools import partial
 
 import torch as th
 
-from experiments.attacks import Finding, files, inputs, kills, numbers
-from experiments.attacks.command_lines import wrong_command_lines
+from experiments.attacks import Finding, files, inputs, kills
 
 
 def attacks(folder: pathlib.Path, n_kills: int, rng: random.Random) -> dict[str, list[Callable[[], Finding]]]:
     """
     :param folder: folder for temporary files
     :param n_kills: number of kills per test that kills
-    :param rng: chooses the times of kills and the places of damage
+    :param rng: chooses the times of kills
     :return: tests by their name in ``--only``
     """
     return {
@@ -34,15 +33,8 @@ def attacks(folder: pathlib.Path, n_kills: int, rng: random.Random) -> dict[str,
             partial(kills.killed_runs, folder / "runs", n_kills, rng, at_once=2),
             partial(kills.killed_benchmark, folder / "benchmark", n_kills, rng),
         ],
-        "resumes": [partial(kills.resumed_runs, folder / "resumed")],
-        "inputs": [inputs.wrong_arguments, inputs.without_asserts, partial(wrong_command_lines, folder / "lines")],
-        "numbers": [partial(numbers.not_a_number, folder / "numbers")],
-        "files": [
-            partial(files.strangers_files, folder / "hostile"),
-            partial(files.damaged_files, folder / "damaged", rng),
-            partial(files.full_disk, folder / "disk"),
-            partial(files.shared_path, folder / "shared"),
-        ],
+        "inputs": [inputs.wrong_arguments, inputs.without_asserts],
+        "files": [partial(files.strangers_files, folder / "hostile"), partial(files.full_disk, folder / "disk")],
     }
 
 
@@ -52,7 +44,7 @@ def main() -> None:
     parts = list(attacks(pathlib.Path(), 0, random.Random()))
     parser.add_argument("--only", nargs="+", choices=parts, default=parts, help="a subset of the parts (default: all)")
     parser.add_argument("--kills", type=int, default=100, help="number per test that kills (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of times and places (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of these times (default: 0)")
     parser.add_argument("--out", type=pathlib.Path, help="a Markdown file for the table")
     args = parser.parse_args()
     th.set_num_threads(1)

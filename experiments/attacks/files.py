@@ -1,4 +1,4 @@
-"""Hostile, damaged and shared files, and a disk without space."""
+"""Hostile files, and a disk without space."""
 
 import base64
 import contextlib
@@ -7,7 +7,6 @@ import json
 import os
 import pathlib
 import pickle
-import random
 import resource
 import shutil
 import subprocess
@@ -17,7 +16,6 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,7 @@ import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 
-from experiments.attacks import Finding, are_equal, make, partial_files
+from experiments.attacks import Finding, make, partial_files
 from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.benchmark.training import load_checkpoint
 from sb3_eqr.common.saving.checkpoints import MANIFEST, checksum_of, digest, find_checkpoints
@@ -283,72 +281,6 @@ def swapped(folder: pathlib.Path, times: int) -> bool:
     is_over.set()
     thread.join()
     return ran
-
-
-def damaged_files(folder: pathlib.Path, rng: random.Random) -> Finding:
-    """Truncate each kind of file at 20 places and flip a bit at 20; loading must fail and leave the agent unchanged."""
-    model = trained(folder)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    size, env = model.replay_buffer.size(), model.get_env()
-    checkpoint = find_checkpoints(folder / "checkpoints")[-1]
-    loads: dict[pathlib.Path, Callable[[], Any]] = {
-        folder / "model.zip": lambda: (model.set_parameters(folder / "model.zip"), EqRQRDQN.load(folder / "model.zip")),
-        folder / "buffer.pkl": lambda: model.load_replay_buffer(folder / "buffer.pkl"),
-    }
-    loads |= {path: lambda: EqRQRDQN.resume(checkpoint, env) for path in sorted(checkpoint.iterdir())}
-    wrong, count = [], 0
-    for path, load in loads.items():
-        whole = path.read_bytes()
-        for kind in ["truncated"] * 20 + ["flipped"] * 20:
-            place = rng.randrange(len(whole))
-            changed = bytearray(whole)
-            changed[place] ^= 1 << rng.randrange(8)
-            path.write_bytes(whole[:place] if kind == "truncated" else bytes(changed))
-            count += 1
-            what = f"{path.name}, {kind} at {place}"
-            try:
-                with contextlib.redirect_stdout(io.StringIO()):
-                    load()
-                wrong.append(f"{what}: loaded")
-            except Exception as error:
-                wrong += [] if str(error) else [f"{what}: {type(error).__name__} without a message"]
-            path.write_bytes(whole)
-            if not are_equal(before, model.policy.state_dict()) or model.replay_buffer.size() != size:
-                wrong.append(f"{what}: the agent has changed")
-    test = f"{count} damaged files of {len(loads)} kinds"
-    return Finding(test, "every one rejected, the model unchanged", f"{count - len(wrong)} rejected", wrong)
-
-
-def shared_path(folder: pathlib.Path) -> Finding:
-    """Save to one path and load from it in several threads."""
-    folder.mkdir(parents=True)
-    model, buffer = folder / "model", folder / "buffer"
-    make().save(model)
-    make().save_replay_buffer(buffer)
-    wrong: list[str] = []
-
-    def repeat(kind: str, times: int, call: Callable[[], Any]) -> None:
-        for _ in range(times):
-            try:
-                call()
-            except Exception as error:
-                wrong.append(f"{kind}: {type(error).__name__}: {error}")
-
-    calls: list[tuple[str, int, Callable[[], Any]]] = []
-    for seed in range(4):
-        saver, reader = make(seed=seed), make()
-        calls += [("saves", 24, partial(saver.save, model)), ("saves", 24, partial(saver.save_replay_buffer, buffer))]
-        calls += [("loads", 56, partial(EqRQRDQN.load, model)), ("loads", 56, partial(reader.load_replay_buffer, buffer))]
-    threads = [threading.Thread(target=repeat, args=call) for call in calls]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    n_saves, n_loads = (sum(times for kind, times, _ in calls if kind == wanted) for wanted in ("saves", "loads"))
-    left = partial_files(folder)
-    found = f"{len(wrong)} failures, {len(left)} partial files"
-    test = f"threads on one path: {n_saves} saves, {n_loads} loads"
-    return Finding(test, "0 failures, 0 partial files", found, wrong[:10] + left)
 
 
 def full_disk(folder: pathlib.Path) -> Finding:

@@ -1,27 +1,22 @@
-"""Runs that are killed at random times, or stop and are resumed: nothing may be lost, and no result may change."""
+"""Runs that are killed at random times: nothing may be lost, and no result may change."""
 
 import json
 import multiprocessing
 import os
 import pathlib
 import random
-import shutil
 import signal
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from experiments.attacks import Finding, are_equal, finish, partial_files
-from sb3_eqr import EqRQRDQN, EqRRainbow
+from sb3_eqr import EqRQRDQN
 from sb3_eqr.benchmark.runs import RESULT, Run, Settings, plan_runs
 from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.benchmark.training import execute
-from sb3_eqr.common.saving.checkpoints import find_checkpoints
-from sb3_eqr.envs import ResumableWrapper, make_atari100k_env
-from sb3_eqr.envs.minatar import ChannelsFirstImage
 
 STEPS, SAVE_FREQ = 30_000, 60  # several checkpoints per second
 LONGEST = 1.5  # maximum seconds before a run is killed
@@ -115,62 +110,3 @@ def scores(run: Run) -> Any:
     path = run.folder / RESULT
     result = json.loads(path.read_text()) if path.is_file() else None
     return None if result is None else (result["evaluations"], result["training"])
-
-
-AGENTS: dict[str, Any] = {"EqRQRDQN": EqRQRDQN, "EqRRainbow": EqRRainbow}
-LENGTH, STOP = 1_200, 600
-
-
-def normalized(n_envs: int) -> VecEnv:
-    """CartPole with ``VecNormalize``."""
-    return VecNormalize(make_vec_env("CartPole-v1", n_envs))
-
-
-def parallel(n_envs: int) -> VecEnv:
-    """CartPole in processes of its own."""
-    return make_vec_env("CartPole-v1", n_envs, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableWrapper)
-
-
-def minatar(n_envs: int) -> VecEnv:
-    """MinAtar's Breakout, two frames stacked."""
-    return VecFrameStack(make_vec_env("MinAtar/Breakout-v1", n_envs, wrapper_class=ChannelsFirstImage), 2)
-
-
-# name -> environments of a given number; all but CartPole's are images
-WORLDS: dict[str, Callable[..., VecEnv]] = {
-    "CartPole (Monitor, TimeLimit)": partial(make_vec_env, "CartPole-v1"),
-    "CartPole (VecNormalize)": normalized,
-    "CartPole (SubprocVecEnv)": parallel,
-    "MinAtar Breakout (VecFrameStack)": minatar,
-    "Atari's Breakout (VecFrameStack)": partial(make_atari100k_env, "Breakout"),
-    "sliding ball": partial(make_vec_env, "SlidingBallTorus-v0"),
-}
-
-
-def train_in(agent: str, world: str, n_envs: int, folder: pathlib.Path) -> None:
-    """Train an agent to the end, or resume it from the checkpoint in ``folder``, and save it there."""
-    name, env = "resumed" if find_checkpoints(folder) else "whole", WORLDS[world](n_envs=n_envs)
-    options: dict[str, Any] = {"buffer_size": 2_000, "batch_size": 8, "learning_starts": 40, "n_steps": 3, "train_freq": 4}
-    if not world.startswith("CartPole"):
-        options |= {"policy": "CnnPolicy", "policy_kwargs": {"features_extractor_kwargs": {"layers": [[4, 3, 2]]}}}
-    finish(folder, env, LENGTH, STOP, AGENTS[agent], **options, seed=3, device="cpu").save(folder / name)
-    env.close()
-    for later in find_checkpoints(folder)[1:]:  # as if the run had stopped after its first checkpoint
-        shutil.rmtree(later)
-
-
-def resumed_runs(folder: pathlib.Path) -> Finding:
-    """Each agent in each world, with one environment and with four."""
-    context = multiprocessing.get_context("spawn")
-    runs = [(agent, world, n_envs) for agent in AGENTS for world in WORLDS for n_envs in (1, 4)]
-    wrong = []
-    for i, (agent, world, n_envs) in enumerate(runs):
-        for _ in range(2):
-            process = context.Process(target=train_in, args=(agent, world, n_envs, folder / str(i)))
-            process.start()
-            process.join()
-        whole, resumed = (AGENTS[agent].load(folder / str(i) / name) for name in ("whole", "resumed"))
-        if resumed._n_updates != whole._n_updates or not are_equal(whole.policy.state_dict(), resumed.policy.state_dict()):
-            wrong.append(f"{agent}, {world}, {n_envs} environments")
-    name = f"{len(runs)} runs, stopped half-way and resumed in a new process ({', '.join(WORLDS)}; 1 and 4 environments)"
-    return Finding(name, "equal bits", f"{len(runs) - len(wrong)} of {len(runs)} equal bits", wrong)

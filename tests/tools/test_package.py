@@ -1,4 +1,4 @@
-"""What users get besides the code: extras, docstrings, the command, the script of the installation."""
+"""What users get besides the code: extras, docstrings, the command."""
 
 import inspect
 import os
@@ -10,7 +10,6 @@ import sys
 import pytest
 
 import sb3_eqr
-from experiments import installation
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.policies import EqRPolicy
@@ -68,17 +67,6 @@ def test_the_command_lets_waiting_threads_sleep_before_pytorch_is_loaded(chosen)
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     lines = found.stdout.splitlines()
     assert lines[0] == "False" and lines[-1] == (chosen or "PASSIVE") and "usage" in found.stdout
-
-
-def test_the_commands_of_the_installation_script_are_those_of_the_pages():
-    pages = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in installation.PAGES)
-    lines = [re.sub(r"\s+", " ", line.strip()) for line in pages.replace("\\\n", " ").splitlines()]
-    of_pages = tuple(line for line in lines if line.startswith("sb3-eqr "))
-    assert all(command.startswith(of_pages) for command in installation.COMMANDS)  # followed by what shortens it
-    assert all(long in pages for long in installation.SHORTER)
-    for page in installation.PAGES:
-        text = installation.script(ROOT / page)
-        assert "EqR" in text and "_000" not in text.replace("seed=1_000", "")
 
 
 def test_the_module_of_the_command_runs_it():
