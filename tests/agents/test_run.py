@@ -14,7 +14,7 @@ from sb3_contrib import QRDQN
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import FakeImageEnv, IdentityEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
@@ -460,12 +460,6 @@ def test_tensorboard(make, tmp_path):
     make(ChainEnv(length=10), tensorboard_log=str(tmp_path)).learn(60, log_interval=1)
     assert [path.name for path in tmp_path.iterdir()] == [f"{make.algorithm.__name__}_1"]
     assert any("tfevents" in path.name for path in (tmp_path / f"{make.algorithm.__name__}_1").iterdir())
-
-
-def test_progress_bar_and_fake_images(make):
-    env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=True)
-    model = make(env, "CnnPolicy").learn(50, progress_bar=True)
-    assert model.num_timesteps >= 50 and model._n_updates > 0
 
 
 def test_flags_as_arrays_are_stored(make):

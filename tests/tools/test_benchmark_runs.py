@@ -24,7 +24,7 @@ from sb3_eqr.benchmark.suites import choose, load_suite, read_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.env_state import capture, restore
-from sb3_eqr.envs import atari, make_atari100k_env
+from sb3_eqr.envs import make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
 from tests.toys import ChainEnv
 
@@ -282,12 +282,6 @@ def test_atari_is_evaluated_on_full_games_as_in_the_paper():
         assert np.array_equal(obs, plain_obs) and np.array_equal(rewards, plain_rewards) and np.array_equal(dones, plain_dones)
         total += rewards
     assert np.abs(total).max() > 0
-
-
-def test_an_endless_atari_game_is_counted_at_the_step_limit(monkeypatch):
-    monkeypatch.setattr(atari, "MAX_STEPS", 30)
-    _, lengths = evaluate(Fixed(), atari_protocol("Boxing", n_envs=1), 2, seed=0)
-    assert lengths == [30, 30]
 
 
 @pytest.mark.parametrize("normalize", [{"norm_obs": False}, {"norm_obs_keys": ["vec"]}, {}], ids=str)

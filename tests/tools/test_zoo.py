@@ -466,17 +466,6 @@ def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     assert yaml.safe_load(again.out.partition("As a file for --conf-file:")[2])["MinAtar/Breakout-v1"] == entry
 
 
-def test_minatar_is_deterministic_with_a_seed():
-    """The seed determines the game."""
-    games = []
-    for seed in (5, 5, 6):
-        env = gym.make("MinAtar/Asterix-v1")
-        observations = [env.reset(seed=seed)[0]]
-        observations += [env.step(step % 3)[0] for step in range(50)]
-        games.append(np.array(observations))
-    assert (games[0] == games[1]).all() and (games[0] != games[2]).any()
-
-
 def test_the_command_without_rl_zoo(monkeypatch):
     """Prints one line instead of a traceback."""
     for name in [name for name in sys.modules if name.startswith("sb3_eqr.zoo")]:
