@@ -10,7 +10,6 @@ import json
 import os
 import pathlib
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,74 +25,31 @@ from torch.utils.benchmark import Timer
 from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
-from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, NETWORKS, OFF, Floor, Table, median, take_turns
+from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, NETWORKS, OFF, Table, median, take_turns
 from sb3_eqr.common.saving.files import atomic_write
 
-FLOOR, ONES = "floor", ", rounds of one"
 TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
 N_COUNTED, N_BEFORE = 10, 50  # counted updates, after others that warm up
-NEIGHBOUR_ROUNDS = 8  # maximum, as these rounds are slow
-BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with this process at the latest
 AGENT = "EqRRainbow"  # of parts
 Call = Callable[..., object]
 Row = dict[str, Any]
 
 
-def in_rounds_of_one(model: Any, n_updates: int) -> None:
-    """The same number of updates as ``model.train(n_updates)``, one per call."""
-    for _ in range(n_updates):
-        model.train(1, model.batch_size)
-
-
 def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
-    """An update of each agent on each network, compared with QRDQN's and the floor, in long rounds and in rounds of one."""
+    """An update of each agent on each network, compared with QRDQN's."""
     for key in args.network or NETWORKS:
         n_updates, models = NETWORKS[key].n_updates, {name: workload.make_trainable(name, key, N_BEFORE) for name in AGENTS}
         updates = {name: partial(model.train, N_COUNTED, model.batch_size) for name, model in models.items()}
         counted = {name: workload.count_operations(call) / N_COUNTED for name, call in updates.items()}
-        floor = Floor(models[AGENT]) if key == "atari" else None
-        stored = {name: workload.bytes_per_transition(model) for name, model in models.items() if floor}
-        calls: dict[str, Call] = {FLOOR: partial(floor.steps, n_updates)} if floor else {}
+        calls = {name: partial(model.train, n_updates, model.batch_size) for name, model in models.items()}
+        found, rows = take_turns(calls, args.rounds, n_updates), []
         for name, model in models.items():
-            calls[name] = partial(model.train, n_updates, model.batch_size)
-            calls[name + ONES] = partial(in_rounds_of_one, model, n_updates)
-        found = take_turns(calls, args.rounds, n_updates)
-
-        def ratio(name: str, other: str, found: dict[str, Any] = found) -> float | None:
-            return found[name].ratio(found[other]) if name in found and other in found else None
-
-        rows: list[Row] = []
-        for name in [FLOOR, *models] if floor else models:
+            before = found.get(name + BEFORE)
             row = {"name": name, "ms": median(found[name].ms), "cpu_ms": median(found[name].cpu_ms)}
-            row |= {"times_QRDQN": ratio(name, "QRDQN"), "times_floor": ratio(name, FLOOR)}
-            row |= {"times_before": ratio(name, name + BEFORE), "round_of_one": ratio(name + ONES, name)}
-            row |= {"operations": counted.get(name), "page_faults": median(found[name].faults)}
-            rows.append(row | {"bytes_per_transition": stored.get(name)})
-        notes = [floor.description()] if floor else []
-        yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
-
-
-def measure_neighbour(args: argparse.Namespace) -> Iterator[Table]:
-    """Updates on Atari frames with one and with two threads, while another process is busy."""
-    models = {name: workload.make_trainable(name) for name in ("DQN", "QRDQN", *EQR_AGENTS)}
-
-    def update(model: Any, n_threads: int) -> None:
-        th.set_num_threads(n_threads)
-        model.train(1, model.batch_size)
-
-    calls = {f"{name} {n}": partial(update, model, n) for name, model in models.items() for n in (1, 2)}
-    process = subprocess.Popen([sys.executable, "-c", BUSY])
-    try:
-        found = take_turns(calls, min(args.rounds, NEIGHBOUR_ROUNDS))
-    finally:
-        process.kill()
-        process.wait()
-        th.set_num_threads(args.threads)
-    rows = []
-    for name in models:
-        one, two = found[f"{name} 1"].ms, found[f"{name} 2"].ms
-        rows.append({"name": name, "ms_1_thread": median(one), "ms_2_threads": median(two), "slowdown": median(two / one)})
-    yield Table("neighbour", "Update, atari, beside a busy process", rows)
+            row |= {"times_QRDQN": found[name].ratio(found["QRDQN"])}
+            row |= {"times_before": found[name].ratio(before) if before else None, "operations": counted[name]}
+            rows.append(row | {"bytes_per_transition": workload.bytes_per_transition(model) if key == "atari" else None})
+        yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows)
 
 
 def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
@@ -110,8 +66,7 @@ def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
         failure = agents[2]._captured.failure
         is_right = apart <= max(TOLERANCE, 2 * apart_again) and (failure is None or args.device == "cpu")
         n_updates, models = NETWORKS["atari"].n_updates, {"eager": agents[1], "captured": agents[2]}
-        calls: dict[str, Call] = {FLOOR: partial(Floor(agents[0]).steps, n_updates)}
-        calls |= {way: partial(one.train, n_updates, one.batch_size) for way, one in models.items()}
+        calls = {way: partial(one.train, n_updates, one.batch_size) for way, one in models.items()}
         times = {f"{way}_ms": median(found.ms) for way, found in take_turns(calls, args.rounds, n_updates).items()}
         apart_by = {"eager_again": apart_again, "captured": apart}
         rows.append({"name": name, **times, **apart_by, "capture": failure or "captured", "ok": is_right})
@@ -166,14 +121,14 @@ def measure_parts(args: argparse.Namespace) -> Iterator[Table]:
         yield Table(f"parts_{key}", f"Parts of an update, {key}, batch {NETWORKS[key].batch_size}", rows, notes)
 
 
-PARTS = {"updates": measure_updates, "neighbour": measure_neighbour, "graph": measure_graph, "parts": measure_parts}
+PARTS = {"updates": measure_updates, "graph": measure_graph, "parts": measure_parts}
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the given arguments, or else the command line; argparse reports wrong ones."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=__doc__.strip().split("\n")[0])
     several = partial(str.split, sep=",")
-    parser.add_argument("--only", type=several, default=["updates", "neighbour"], help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("--only", type=several, default=["updates"], help=f"some of {', '.join(PARTS)}")
     parser.add_argument("--network", type=several, help=f"of updates and parts: some of {', '.join(NETWORKS)}; default: all")
     parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
     parser.add_argument("--rounds", type=int, default=20, help="number of rounds")

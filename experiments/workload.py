@@ -1,8 +1,7 @@
-"""What the speed script measures and how: agents, random frames, the floor of an update's time; clocks, tables."""
+"""What the speed script measures and how: agents, random frames; clocks, tables."""
 
 import importlib
 import pathlib
-import resource
 import sys
 import time
 import warnings
@@ -21,10 +20,8 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
-from torch import nn
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.benchmark import timer
-from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_eqr import EqRQRDQN, EqRRainbow
 from sb3_eqr.common.networks.encoders import ConvExtractor
@@ -147,57 +144,11 @@ def bytes_per_transition(model: Any) -> float:
     return nbytes / (buffer.buffer_size * buffer.n_envs)
 
 
-class Floor:
-    """
-    The convolutions of one update of an EqR agent whose target is a copy of its online network: without gradient for the
-    observation after the transition and the M observations of the rollout; with gradient, except that of the images, for the
-    observation itself. Each runs on separate inputs, float32, channels last.
-    """
-
-    def __init__(self, model: Any):
-        encoder = model.policy.online.features_extractor
-        self.n_trained = model.batch_size
-        self.n_forward = model.batch_size * (1 + (model.depth if model.aet_coef > 0 else 0))
-        self._work: list[tuple[nn.Module, th.Tensor, th.Tensor, th.Tensor]] = []  # images: forward, trained; gradient
-
-        def note(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
-            sizes = ((self.n_forward, *inputs), (self.n_trained, *inputs), (self.n_trained, output))
-            images = [th.rand(n, *one.shape[1:], device=model.device) for n, one in sizes]
-            forward, trained, gradient = (one.to(memory_format=th.channels_last) for one in images)
-            self._work.append((module, forward, trained.requires_grad_(bool(self._work)), gradient))
-
-        hooks = [module.register_forward_hook(note) for module in encoder.modules() if isinstance(module, nn.Conv2d)]
-        with th.no_grad():
-            encoder(th.zeros(1, *model.observation_space.shape, device=model.device))
-        for hook in hooks:
-            hook.remove()
-        with FlopCounterMode(display=False) as counter:
-            self.steps(1)
-        self.flop = counter.get_total_flops()  # of one update
-
-    def steps(self, n_updates: int) -> None:
-        """Run the convolutions of ``n_updates`` updates."""
-        for _ in range(n_updates):
-            with th.no_grad():  # ``forward`` skips hooks
-                for module, images, _, _ in self._work:
-                    module.forward(images)
-            outputs = [module.forward(images) for module, _, images, _ in self._work]
-            for (module, _, images, gradient), output in reversed(list(zip(self._work, outputs, strict=True))):
-                wanted = [*module.parameters(), *([images] if images.requires_grad else [])]
-                th.autograd.grad(output, wanted, gradient)
-
-    def description(self) -> str:
-        """A description in one line."""
-        images = f"{self.n_forward} images forward, {self.n_trained} forward and backward"
-        return f"floor: {len(self._work)} convolutions, channels last, {images}: {self.flop / 1e9:.3f} GFLOP an update"
-
-
 class Series(NamedTuple):
     """The cost of one of the calls compared, per round, (rounds,) each."""
 
     ms: np.ndarray  # milliseconds of wall-clock time
     cpu_ms: np.ndarray  # milliseconds of CPU time, over all threads of this process
-    faults: np.ndarray  # page faults
 
     def ratio(self, other: "Series") -> float:
         """Median of the ratios within a round: of CPU time if PyTorch has one thread, else of wall-clock time."""
@@ -211,8 +162,8 @@ def median(numbers: Any) -> float:
 
 
 def read_clocks() -> np.ndarray:
-    """In the order of ``Series``, so far. PyTorch's timer waits for a GPU first; faults are those without reading a disk."""
-    return np.array([timer() * 1e3, time.process_time() * 1e3, resource.getrusage(resource.RUSAGE_SELF).ru_minflt])
+    """In the order of ``Series``, so far. PyTorch's timer waits for a GPU first."""
+    return np.array([timer() * 1e3, time.process_time() * 1e3])
 
 
 def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, n_per_call: int = 1) -> dict[str, Series]:

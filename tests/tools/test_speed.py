@@ -9,38 +9,14 @@ import pytest
 import torch as th
 
 from experiments import speed, workload
-from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Floor, Series, Table, fill, make_agent
+from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Series, Table, fill, make_agent
 from sb3_eqr import EqRQRDQN
 from tests.tools.test_package import ROOT
-
-# Outputs × filters × (weights of a filter) × 2, by hand for the network of Mnih et al. 2015 on 84×84×4
-NATURE_FLOP = [20 * 20 * 32 * (8 * 8 * 4) * 2, 9 * 9 * 64 * (4 * 4 * 32) * 2, 7 * 7 * 64 * (3 * 3 * 64) * 2]
-FORWARD = 6_553_600 + 5_308_416 + 3_612_672
-
-
-@pytest.mark.parametrize(
-    ("name", "kwargs", "n_forward"),
-    [("EqRQRDQN", {}, 192), ("EqRQRDQN" + OFF, {}, 32), ("EqRRainbow", {"prediction_depth": 2, "batch_size": 8}, 24)],
-)
-def test_floor_by_hand(name, kwargs, n_forward):
-    floor = Floor(make_agent(name, buffer_size=64, **kwargs))
-    n_trained = kwargs.get("batch_size", 32)
-    backward = 2 * FORWARD - NATURE_FLOP[0]  # images need no gradient
-    assert sum(NATURE_FLOP) == FORWARD and (floor.n_forward, floor.n_trained) == (n_forward, n_trained)
-    assert floor.flop == FORWARD * (n_forward + n_trained) + backward * n_trained
 
 
 def test_bytes_per_transition():
     stock, ours = (workload.bytes_per_transition(make_agent(name)) for name in ("QRDQN", "EqRQRDQN"))
     assert ours <= 8_500 < 56_000 < stock
-
-
-def test_floor_does_not_change_the_agent():
-    model = make_agent("EqRQRDQN", buffer_size=64, prediction_depth=1, batch_size=2)
-    before = [parameter.clone() for parameter in model.policy.parameters()]
-    Floor(model).steps(2)
-    for old, new in zip(before, model.policy.parameters(), strict=True):
-        assert th.equal(old, new) and new.grad is None
 
 
 class Cube(th.autograd.Function):
@@ -70,12 +46,12 @@ def test_calls_are_timed_alternately():
     calls = {name: lambda name=name: order.append(name) for name in "ab"}
     timings = workload.take_turns(calls, rounds=3, n_per_call=2)
     assert order == list("ab" * 4)  # the first round is a warm-up
-    assert [len(numbers) for name in "ab" for numbers in timings[name]] == [3] * 6
+    assert [len(numbers) for name in "ab" for numbers in timings[name]] == [3] * 4
 
 
 def test_ratios(monkeypatch):
     ms, more = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
-    fast, slow = Series(ms, ms, ms), Series(more, 3 * more, ms)
+    fast, slow = Series(ms, ms), Series(more, 3 * more)
     monkeypatch.setattr(th, "get_num_threads", lambda: 1)
     assert slow.ratio(fast) == 6.0  # of CPU time
     monkeypatch.setattr(th, "get_num_threads", lambda: 2)
@@ -90,7 +66,7 @@ def test_a_table():
 
 def test_options():
     args = speed.parse([])
-    assert args.only == ["updates", "neighbour"] and args.network is None
+    assert args.only == ["updates"] and args.network is None
     args = speed.parse(["--only", "parts,graph", "--network", "minatar,cartpole", "--before", str(ROOT)])
     assert args.only == ["parts", "graph"] and args.network == ["minatar", "cartpole"]
 
@@ -98,7 +74,7 @@ def test_options():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, neighbour, graph, parts, got 'stepz'"),
+        ("--only stepz", "--only must be some of updates, graph, parts, got 'stepz'"),
         ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
         ("--before nowhere", "--before must be a folder with sb3_eqr in it, got 'nowhere'"),
@@ -129,13 +105,13 @@ def test_importing_another_version_together_with_this_one(monkeypatch):
 
 @pytest.mark.slow
 def test_script_prints_its_tables(tmp_path):
-    parts = ["--only", "updates,neighbour", "--network", "minatar", "--before", str(ROOT)]
+    parts = ["--only", "updates", "--network", "minatar", "--before", str(ROOT)]
     command = [sys.executable, "-m", "experiments.speed", "--threads", "1", "--rounds", "1", *parts]
     done = subprocess.run([*command, "--json", tmp_path / "speed.json"], check=True, capture_output=True, text=True, cwd=ROOT)
     found = json.loads((tmp_path / "speed.json").read_text())
     assert {"command", "threads", "versions"} <= found.keys() and done.stdout.startswith(found["cpu"])
     tables = found["tables"]
-    assert list(tables) == ["updates_minatar", "neighbour"]
+    assert list(tables) == ["updates_minatar"]
     assert all(table["title"] in done.stdout for table in tables.values())
     operations = {row["name"]: row["operations"] for row in tables["updates_minatar"]["rows"]}
     assert (operations["DQN"], operations["QRDQN"]) == (140, 170)
