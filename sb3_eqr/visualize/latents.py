@@ -114,8 +114,8 @@ def play(
     factors: list[np.ndarray | None] = []
     with preserved_rng_state(model.action_space, env.action_space):
         obs = reset(model, env, seed)
-        space = _space(obs, env.observation_space)
-        buffer = SequenceReplayBuffer(n_steps, space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth)
+        both = env.observation_space, env.action_space
+        buffer = SequenceReplayBuffer(n_steps, *both, "cpu", n_envs=env.num_envs, prediction_depth=depth)
         infos: list[dict[str, Any]] = env.unwrapped.reset_infos
         for _ in range(buffer.buffer_size):
             factors.append(_factors(infos))
@@ -136,14 +136,6 @@ def play(
 def stored(model: EqROffPolicy, actions: np.ndarray) -> np.ndarray:
     """Actions as the replay buffer has them: those of a Box are scaled to [-1, 1]."""
     return model.policy.scale_action(actions) if isinstance(model.action_space, spaces.Box) else actions
-
-
-def _space(obs: Any, space: spaces.Space) -> spaces.Space:
-    """The space of the observations: VecNormalize makes floats of integers, but keeps the space of vectors."""
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: _space(obs[key], part) for key, part in space.spaces.items()})
-    is_changed = np.issubdtype(space.dtype, np.integer) and np.issubdtype(obs.dtype, np.floating)
-    return spaces.Box(-np.inf, np.inf, space.shape, np.float32) if is_changed else space
 
 
 def _factors(infos: list[dict[str, Any]]) -> np.ndarray | None:

@@ -1,16 +1,13 @@
 """The linear probes of agents."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch as th
 
-from experiments import probes
 from experiments.probes import explained, make, probe
 from sb3_eqr import EqRQRDQN
-from sb3_eqr.envs import make_atari100k_env
 from tests.toys import ImageEnv
 
 
@@ -46,19 +43,7 @@ def test_r2_of_noise():
     assert explained(x, x @ [3.0, 4.0] + 5 * rng.normal(size=6_000)) == pytest.approx(0.5, abs=0.04)
 
 
-def test_a_ball_that_is_not_in_play_has_no_position(monkeypatch):
-    """Breakout's frames say so as well: between bricks and paddle, nothing but the ball is lit."""
-    monkeypatch.setattr(probes, "N_FRAMES", 150)
-    env = make_atari100k_env("Breakout", n_envs=1, seed=0)
-    still = SimpleNamespace(predict=lambda obs, deterministic: (np.zeros(1, dtype=int), None))
-    seen, known = probes.watch(still, env, "atari100k", "Breakout", np.random.default_rng(0))
-    is_out, is_lit = np.isnan(known["ball: y"]), (seen[:, 40:74, 5:79, -1] > 0).any(axis=(1, 2))
-    is_between = (known["ball: y"] > 90) & (known["ball: y"] < 175)
-    assert is_out.any() and is_between.any() and np.array_equal(np.isnan(known["ball: x"]), is_out)
-    assert not is_lit[is_out].any() and is_lit[is_between].all()
-
-
 def test_agents_of_the_benchmark_are_probed():
     """In random states of the torus, whose position untrained features hold."""
-    model = make("eqr_qrdqn:experiments/settings/worlds.yml:plain", "worlds", "torus", 0, 0)
+    model = make("eqr_qrdqn:experiments/settings/worlds.yml:plain", "torus", 0, 0)
     assert model.depth == 0 and model.n_steps == 3 and model.get_env().envs[0].unwrapped.n_steps == 16
