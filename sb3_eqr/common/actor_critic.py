@@ -24,6 +24,7 @@ RULES = {
     "target_update_interval": integer(1),
     "top_quantiles_to_drop_per_net": integer(0),  # of TQC
 }
+LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")  # of SB3, means over a round
 SCALE_INTERVAL = 1_000  # updates between two estimates of the rewards' spread, each of which takes all rewards
 MIN_REWARDS = 100  # for an estimate
 MIN_SPREAD = 1e-4  # as a share of the largest reward; below, it may be rounding
@@ -131,6 +132,8 @@ class EqRActorCritic(EqROffPolicy):
                 super().train(gradient_steps, batch_size)  # type: ignore[misc]
             finally:
                 self.replay_buffer = buffer
+        recorded = self.logger.name_to_value
+        self._monitor.check_losses({name: recorded[name] for name in LOSSES if name in recorded}, self._n_updates)
 
     def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:
         """One update of encoder and latent model, and of their moving averages."""

@@ -93,11 +93,6 @@ class ActorCriticOptions(LatentOptions):
                     f"n_blocks must be None or 1 without a group, got {self.n_blocks}. "
                     'Pass a group such as group="SE(2)" in its place, or another number of values such as group="none(216)".'
                 )
-            if not self.state_dependent_actions:
-                raise ValueError(
-                    f"state_dependent_actions must be True with group={self.group!r}, where it predicts by κ(s, a) alone, "
-                    'got False. Pass a group such as group="SE(2)".'
-                )
 
 
 class LatentReader(BaseFeaturesExtractor):

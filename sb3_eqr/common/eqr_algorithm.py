@@ -286,6 +286,12 @@ class EqRAlgorithm(EqROffPolicy):
         if self.learning_starts is None and self._total_timesteps > 0:
             self.learning_starts = min(int(self._total_timesteps) // 10, MAX_LEARNING_STARTS)
         validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)
+        interval, done = self._resets.schedule.interval, self._resets.done
+        if interval is not None and not done and self._updates_left() < max(interval - self._n_updates, 0) + interval:
+            warnings.warn(
+                f"resets: interval={interval} is too long for a reset in this call of learn, because a full interval of "
+                "updates must be left after it. Pass a smaller interval, or learn all steps in one call."
+            )
         return result
 
     def _on_step(self) -> None:
@@ -353,16 +359,16 @@ class EqRAlgorithm(EqROffPolicy):
         return norms[0] if len(norms) == 1 else th.linalg.vector_norm(th.stack(norms))
 
     def _updates_left(self) -> float:
-        """How many updates later rounds of this call of ``learn`` will make, as the expected number if rounds are episodes."""
+        """How many updates later rounds of this call of ``learn`` will make; expected if rounds are episodes, at first NaN."""
         frequency: Any = self.train_freq
         if self.gradient_steps < 0:
             per_step = 1.0
         elif frequency.unit is TrainFrequencyUnit.STEP:
             per_step = self.gradient_steps / (frequency.frequency * self.n_envs)
         else:
-            lengths = [info["l"] for info in self.ep_info_buffer or []]
-            per_step = self.gradient_steps / (frequency.frequency * np.mean(lengths)) if lengths else 0.0
-        return per_step * (self._total_timesteps - self.num_timesteps)
+            episodes = self._episode_num / self.num_timesteps if self.num_timesteps else np.nan  # per step; not known at first
+            per_step = self.gradient_steps * episodes / frequency.frequency
+        return per_step * (self._total_timesteps - max(self.num_timesteps, self.learning_starts or 0))
 
     def _start_round(self, buffer: SequenceReplayBuffer) -> None:
         self._log_last_round()

@@ -34,7 +34,8 @@ def contrastive_loss(prediction: th.Tensor, target: th.Tensor, mask: th.Tensor) 
     """
     InfoNCE (van den Oord et al. 2018, Eq. 4, https://arxiv.org/abs/1807.03748): the cross-entropy of identifying a
     prediction's own target among the targets of the batch at the same step, with the cosine similarity divided by
-    ``TEMPERATURE`` as logits. A constant representation costs log B, so a collapse does not minimise the loss.
+    ``TEMPERATURE`` as logits. A constant representation costs the logarithm of their number, so a collapse does not minimise
+    the loss.
 
     :param prediction: (B, M, P)
     :param target: (B, M, P)

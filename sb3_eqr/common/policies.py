@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from sb3_eqr.common.checks.arguments import POLICY, check_arguments, with_fields_of
 from sb3_eqr.common.checks.validation import check_policy_kwargs
-from sb3_eqr.common.groups import GroupLayer, NoGroup, Whitening
+from sb3_eqr.common.groups import GroupLayer, NoGroup
 from sb3_eqr.common.latent.conv_latent_model import ConvLatentModel
 from sb3_eqr.common.latent.latent_model import LatentModel, frozen_copy
 from sb3_eqr.common.latent.options import LatentOptions
@@ -357,6 +357,6 @@ def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
 
 
 def ignores_mode(module: nn.Module) -> bool:
-    """Whether a module computes the same in train and in eval mode."""
-    depend = (nn.modules.batchnorm._NormBase, nn.modules.dropout._DropoutNd, nn.RReLU, Whitening)
-    return not any(isinstance(part, depend) for part in module.modules())
+    """Whether a module computes the same in train and in eval mode; one with buffers of its own may keep statistics."""
+    depend = (nn.modules.dropout._DropoutNd, nn.RReLU)
+    return not any(isinstance(part, depend) or part._buffers for part in module.modules() if not isinstance(part, Centering))

@@ -11,7 +11,7 @@ from sb3_eqr.common.checks.validation import check_names
 class ResetSchedule:
     """
     When an agent is reset, and how n and γ are annealed; by default neither. As in BBF, there is no reset if less than a full
-    interval of training would be left after it.
+    interval of this call of ``learn`` would be left after it.
 
     A reset reinitialises the Q head and the AET loss's own projection and predictor (Nikishin et al. 2022,
     https://arxiv.org/abs/2205.07802), shrinks and perturbs encoder and latent model, and clears the optimiser's state

@@ -396,6 +396,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
 
 
 @EACH
+@pytest.mark.parametrize("off", [{}, OFF], ids=["latent", "off"])
+def test_losses_of_the_critics_that_are_not_finite_raise(agent, off, tmp_path):
+    model = make(agent, ent_coef=0.1, **off).learn(32)
+    with th.no_grad():
+        next(model.critic.qf0.parameters() if hasattr(model.critic, "qf0") else model.critic.parameters()).fill_(th.nan)
+    with pytest.raises(FloatingPointError, match=r"update \d+: losses must be finite, got .*critic_loss = nan"):
+        model.learn(1, reset_num_timesteps=False)
+    with pytest.raises(FloatingPointError):
+        model.save(tmp_path / "model")
+
+
+@EACH
 def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
     make(agent, ent_coef=0.1).learn(30, callback=ExactCheckpointCallback(20, tmp_path))
     for other, why in (
@@ -417,7 +429,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"policy_kwargs": {"group": "none(72)", "n_blocks": 3}}, "n_blocks must be None or 1 without a group, got 3"),
         (
             {"policy_kwargs": {"group": "none", "n_blocks": None, "state_dependent_actions": False}},
-            "state_dependent_actions must be True with group='none'",
+            "state_dependent_actions must be True without a group",
         ),
         ({"policy_kwargs": {"group": "none", "n_blocks": None}, "symmetry_coef": 1.0}, "must have inverses for the GET loss"),
         ({"replay_buffer_class": PrioritizedSequenceReplayBuffer}, "must sample uniformly"),

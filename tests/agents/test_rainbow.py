@@ -1,12 +1,14 @@
 """Components of EqRRainbow and options from later work, compared with hand-computed numbers or other implementations."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_eqr import EqRRainbow
 from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
@@ -233,6 +235,33 @@ def test_when_resets_happen(make):
     postponed = make(ChainEnv(), resets={"interval": 15}).learn(50)  # too few updates are left in this call of learn
     assert (postponed._n_updates, postponed._resets.done) == (20, [])
     assert postponed.learn(20, reset_num_timesteps=False)._resets.done == [20, 35]
+
+
+@EITHER
+def test_a_call_of_learn_that_is_too_short_for_a_reset_warns(make):
+    """Two updates per step after step 40: 100 in one call, of which a reset after 50 leaves 50; 40 in each of two."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(ChainEnv(), resets={"interval": 50}).learn(90)
+    model = make(ChainEnv(), resets={"interval": 50})
+    for steps in (60, 20):
+        with pytest.warns(UserWarning, match="interval=50 is too long for a reset in this call of learn"):
+            model.learn(steps, reset_num_timesteps=False)
+    assert model._resets.done == []
+
+
+@EITHER
+def test_episodes_are_counted_without_monitor(make):
+    """Rounds of one episode of 5 steps, an update each: 18 after step 10 of 100; after 12 of these, 6 are left."""
+
+    class Still(ChainEnv):
+        def step(self, action):
+            self.position = 0.0
+            return super().step(1)
+
+    env = DummyVecEnv([lambda: Still(5)])
+    model = make(env, train_freq=(1, "episode"), gradient_steps=1, learning_starts=10, n_steps=1, resets={"interval": 4})
+    assert model.learn(100)._n_updates == 18 and model._resets.done == [4, 8, 12]
 
 
 def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):

@@ -186,6 +186,28 @@ class TinyExtractor(BaseFeaturesExtractor):
         return self.net(obs)
 
 
+class RunningMean(BaseFeaturesExtractor):
+    """Keeps statistics in train mode, by code of its own; notes the sizes of the batches that they are of."""
+
+    def __init__(self, observation_space, sizes):
+        super().__init__(observation_space, 3)
+        self.register_buffer("mean", th.zeros(3))
+        self.sizes = sizes
+
+    def forward(self, obs):
+        if self.training:
+            self.sizes.append(len(obs))
+            self.mean.lerp_(obs.mean(dim=0), 0.1)
+        return obs - self.mean
+
+
+def test_an_extractor_with_statistics_of_its_own_has_a_target(make):
+    sizes = []
+    network = {"features_extractor_class": RunningMean, "features_extractor_kwargs": {"sizes": sizes}}
+    make(ChainEnv(), policy_kwargs=network, batch_size=8).learn(43).train(1, 8)
+    assert set(sizes) == {8}  # the observations before the transitions; all others are computed in eval mode
+
+
 class OwnConvolutions(ConvExtractor):
     def __init__(self, observation_space):
         super().__init__(observation_space, layers=[[8, 8, 4]])

@@ -45,6 +45,11 @@ class UpdateMonitor:
             self._refuse(self._round_start + first + 1, "losses", ", ".join(wrong))
         return [dict(zip(self._names, update, strict=True)) for update in metrics.tolist()]
 
+    def check_losses(self, losses: dict[str, float], n_updates: int) -> None:
+        """Raise FloatingPointError if one of the losses is not finite after ``n_updates``."""
+        if wrong := [f"{name} = {value}" for name, value in losses.items() if not np.isfinite(value)]:
+            self._refuse(n_updates, "losses", ", ".join(wrong))
+
     def check_model(self, n_updates: int) -> None:
         """Raise FloatingPointError if the parameters are not finite after ``n_updates``: the last losses cannot show it."""
         parameters = [tensor.detach() for tensor in self._model.parameters() if tensor.is_floating_point() and tensor.numel()]
