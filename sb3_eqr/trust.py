@@ -96,16 +96,21 @@ def check_zoo_folder(folder: pathlib.Path, packages: Sequence[str] = ()) -> None
     named = [*map(str, arguments.get("gym_packages") or []), *([package] if colon else [])]
     for key in ("env_wrapper", "vec_env_wrapper"):
         named += [name for name in wrapper_names(config.get(key)) if not _is_harmless(name)]
-    named = [name for name in named if name not in packages and not name.startswith(inside)]
+    named = [name for name in named if name not in packages and not _is_of(name, inside)]
     named += [f"{key}: {config[key]}" for key in EVALUATED if isinstance(config.get(key), str) and not is_plain(config[key])]
     imported = [(key, name) for key in IMPORTED for name in wrapper_names(config.get(key)) if key != "policy" or "." in name]
-    named += [f"{key}: {name}" for key, name in imported if not name.startswith(inside)]
+    named += [f"{key}: {name}" for key, name in imported if not _is_of(name, inside)]
     if named:
         raise ValueError(
             f"{folder} must name only packages given with --gym-packages, and wrappers of {', '.join(WRAPPERS)} that write no "
             f"files, got {', '.join(named)}. {PASS_TRUST}"
         )
     check_statistics(folder / "vecnormalize.pkl")
+
+
+def _is_of(name: str, packages: tuple[str, ...]) -> bool:
+    """Whether a text is a name in one of the packages, and no other expression, which RL Zoo may evaluate."""
+    return name.startswith(packages) and all(part.isidentifier() for part in name.split("."))
 
 
 def is_plain(expression: str) -> bool:

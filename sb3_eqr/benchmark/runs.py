@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from sb3_eqr.benchmark.agents import Agent, defaults, find_agent, hyperparameters
 from sb3_eqr.benchmark.evaluation import check_game
-from sb3_eqr.benchmark.selection import flatten
+from sb3_eqr.benchmark.selection import ABSENT, flatten
 from sb3_eqr.benchmark.suites import Strict, Suite, merge, read_suite, write_suite
 from sb3_eqr.common.saving.checkpoints import PREFIX, find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
@@ -118,8 +118,9 @@ class Run:
             if not old.get(what):
                 continue  # begun by a version that did not record the defaults
             before, now = flatten(old[what]), flatten(new[what])
+            absent = ABSENT if what == "entry" else None  # versions may add defaults
             for key in sorted((before.keys() | now.keys()) - {"file"}):
-                was, is_now = before.get(key), now.get(key)
+                was, is_now = before.get(key, absent), now.get(key, absent)
                 if was != is_now:
                     raise ValueError(
                         f"{self.folder}: {key} must be {was!r}, as when the run was started, got {is_now!r}. "

@@ -4,6 +4,7 @@ import json
 from collections import Counter, defaultdict
 from typing import Any
 
+ABSENT = "absent"  # in place of a setting that a file does not have; null may have a meaning of its own
 ON_POLICY = ("a2c", "ppo", "ppo_lstm", "trpo")  # RL Zoo's agents that learn after a whole rollout
 
 
@@ -47,7 +48,7 @@ def settings_differences(results: list[dict[str, Any]]) -> list[str]:
     for result in results:
         own = flatten(result["entry"]["hyperparameters"]), flatten(result.get("defaults", {}))
         usual = first.setdefault((result["agent"], result["game"]), own)
-        keys = {key for key in own[0].keys() | usual[0].keys() if own[0].get(key) != usual[0].get(key)}
+        keys = {key for key in own[0].keys() | usual[0].keys() if own[0].get(key, ABSENT) != usual[0].get(key, ABSENT)}
         keys |= {key for key in own[1].keys() & usual[1].keys() if own[1][key] != usual[1][key]}
         if keys:
             found.setdefault(result["agent"], set()).update(keys)

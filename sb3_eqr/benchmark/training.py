@@ -196,6 +196,7 @@ def build(run: Run, settings: Settings, logs: pathlib.Path) -> tuple[BaseAlgorit
             verbose=0,
             device=settings.device,
             config=str(config),
+            trained_agent=str(logs / "none"),  # beside it, RL Zoo looks for statistics of VecNormalize
         )
         model, _ = manager.setup_experiment()  # type: ignore[misc]
         logged = model.get_env()

@@ -5,6 +5,7 @@ import errno
 import importlib
 import pathlib
 import runpy
+import shlex
 import sys
 from functools import partial
 from typing import Any
@@ -179,7 +180,9 @@ def check_trained(args: argparse.Namespace) -> None:
         unfinished = list(pathlib.Path(args.folder, algo).glob(f"{name}_*/{FOLDER}"))
         if unfinished and not places:
             run = max(unfinished, key=lambda checkpoints: checkpoints.stat().st_mtime).parent  # names: _10 is before _2
-            found = f"{run} was interrupted: sb3-eqr train --algo {algo} --env {args.env} -f {args.folder} --resume {run}"
+            found = f"{run} was interrupted: " + shlex.join(
+                ["sb3-eqr", "train", "--algo", algo, "--env", args.env, "-f", str(args.folder), "--resume", str(run)]
+            )
         elif ids:
             found = f"There are models in {' and '.join(map(str, ids))}: pass --exp-id."
         elif places:

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import pathlib
 import shutil
 import signal
@@ -53,6 +54,8 @@ class ResumableExperiment(ExperimentManager):
         self.checkpoint_every, self.resume, self.trust = given.checkpoint_every, given.resume, given.trust
         self.best: tuple[float, dict[str, Any]] = (-math.inf, {})  # value and parameters of a search's best trial
         self.continue_training = self.continue_training or self.resume is not None
+        # Beside this file, RL Zoo looks for statistics of VecNormalize; beside "", it would find those of the current folder.
+        self.trained_agent = self.trained_agent or os.path.join(self.save_path, "none")
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -60,6 +63,7 @@ class ResumableExperiment(ExperimentManager):
         Ctrl-C, after which RL Zoo saves the agent.
         """
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        self.is_new = not os.path.exists(self.save_path)
         try:
             found = super().setup_experiment()
         except (ValueError, TypeError, IndexError, ImportError) as error:
@@ -74,8 +78,9 @@ class ResumableExperiment(ExperimentManager):
         return found
 
     def _remove_folder(self) -> None:
-        """Remove the folder made for this run, where enjoy would look for a model."""
-        shutil.rmtree(self.save_path, ignore_errors=True)
+        """Remove the folder made for this run, where enjoy would look for a model, unless it was there before."""
+        if self.is_new:
+            shutil.rmtree(self.save_path, ignore_errors=True)
 
     def objective(self, trial: Any) -> float:
         """As RL Zoo's; keeps the best trial, and prunes those that diverge."""
@@ -105,8 +110,9 @@ class ResumableExperiment(ExperimentManager):
 
     def create_callbacks(self) -> None:
         """RL Zoo's callbacks, and one for the checkpoints."""
-        if self.resume is not None and not self.eval_env_kwargs:
-            self.eval_env_kwargs = self.env_kwargs  # RL Zoo looks at the command line only, which need not repeat the run's
+        # RL Zoo evaluates, films and uploads with those of the command line only, not with those of the hyperparameters.
+        self.eval_env_kwargs = self.eval_env_kwargs or self.env_kwargs
+        self.args.env_kwargs = self.env_kwargs or None
         super().create_callbacks()
         if self.checkpoint_every is not None or self.resume is not None:
             # RL Zoo evaluates Atari's agents with random actions, and a resumed run evaluates them at other steps.
@@ -123,6 +129,7 @@ class ResumableExperiment(ExperimentManager):
             fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {model.num_timesteps}.")
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
+        model.verbose, model.tensorboard_log = self.verbose, self.tensorboard_log or model.tensorboard_log
         return model
 
     def learn(self, model: BaseAlgorithm) -> None:

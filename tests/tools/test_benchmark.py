@@ -22,6 +22,7 @@ from sb3_eqr.benchmark.agents import find_agent, hyperparameters
 from sb3_eqr.benchmark.commands import read_seeds
 from sb3_eqr.benchmark.evaluation import make_game
 from sb3_eqr.benchmark.runs import Settings, plan_runs, read_plan, with_present_defaults, write_plan
+from sb3_eqr.benchmark.selection import settings_differences
 from sb3_eqr.benchmark.suites import choose, load_suite, make_suite, merge, read_suite, write_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.configurations import ZOO_KEYS, with_schedule
@@ -231,6 +232,38 @@ def test_runs_with_different_settings_cannot_share_a_folder(files, suite):
         plan_runs(files / "b", suite, ["dqn:fast.yml"], [0])
     with pytest.raises(ValueError, match="must be of suite 'tiny', as those that are there, got 'smoke'"):
         write_plan(files / "b", load_suite("smoke"), [])
+
+
+def test_null_is_not_the_default(files, suite):
+    """group: null is no group; without the key, the agent has SE(2)."""
+    text = "base: eqr_qrdqn\nchanges: {gradient_steps: 1"
+    (files / "one.yml").write_text(text + "}")
+    runs = plan_runs(files / "b", suite, ["eqr_qrdqn:one.yml"], [0])
+    write_plan(files / "b", suite, runs)
+    (runs[0].folder / "result.json").write_text("{}")
+    (files / "one.yml").write_text(text + ", policy_kwargs: {group: null}}")
+    with pytest.raises(ValueError, match=r"policy_kwargs.group must be .*, as when the run was started, got None"):
+        plan_runs(files / "b", suite, ["eqr_qrdqn:one.yml"], [0])
+    entries = [{"policy_kwargs": {"net_arch": [8]}}, {"policy_kwargs": {"net_arch": [8], "group": None}}]
+    results = [{"agent": "a", "game": "g", "entry": {"hyperparameters": entry}} for entry in entries]
+    assert settings_differences(results) == ["a: its runs differ in policy_kwargs.group."]
+
+
+@pytest.mark.parametrize(
+    "base, changes, message",
+    [
+        ("eqr_qrdqn", "frame_stack: 2", "must not change the suite's environment, got its own frame_stack"),
+        ("eqr_qrdqn", "gradient_stepz: 3", "'gradient_stepz' is not an argument of EqRQRDQN"),
+        ("text.yml", "policy_kwargs: {net_arch: [8]}", "policy_kwargs must be a mapping in text.yml"),
+    ],
+)
+def test_changes_of_an_entry_are_checked(files, suite, base, changes, message, capsys):
+    (files / "text.yml").write_text('CartPole-v1: {policy: MlpPolicy, n_timesteps: 60, policy_kwargs: "dict(net_arch=[4])"}')
+    (files / "one.yml").write_text(f"base: {base}\nchanges: {{{changes}}}")
+    protocol = {**suite.protocol("CartPole"), "preprocessing": {"frame_stack": None}}
+    with pytest.raises((ValueError, SystemExit)) as found:
+        hyperparameters(find_agent("eqr_qrdqn:one.yml"), protocol, spaces.Discrete(2))
+    assert message in str(found.value) + capsys.readouterr().err
 
 
 def test_runs_of_a_version_with_other_defaults_cannot_share_a_folder(files, suite, monkeypatch):

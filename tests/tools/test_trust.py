@@ -152,6 +152,16 @@ def test_wrappers_of_kept_libraries_are_allowed(wrapper, tmp_path):
         check_zoo_folder(tmp_path)
 
 
+@pytest.mark.parametrize("key", ["replay_buffer_class", "env_wrapper"])
+def test_expressions_that_begin_with_a_package_of_the_user_are_not_its_names(key, tmp_path):
+    """RL Zoo evaluates the first."""
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({key: "mine.Buffer"}))
+    check_zoo_folder(tmp_path, ["mine"])
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({key: "mine.B if False else [print('ran')]"}))
+    with pytest.raises(ValueError, match=r"got .*mine\.B if False"):
+        check_zoo_folder(tmp_path, ["mine"])
+
+
 @pytest.mark.parametrize("wrapper", ["rl_zoo3.wrappers.np", "gymnasium.wrappers.RecordVideo", "rl_zoo3.wrappersx.Mine"])
 def test_other_names_in_their_place_are_not(wrapper, tmp_path):
     (tmp_path / "config.yml").write_text(yaml.safe_dump({"env_wrapper": wrapper}))

@@ -155,6 +155,29 @@ def test_an_environment_without_an_entry_uses_the_one_for_its_observations(
     assert model._n_updates > 0 and policy in (folder / env_id / "config.yml").read_text()
 
 
+def test_an_environment_of_the_file_is_that_of_evaluations(sb3_eqr, tmp_path):
+    """RL Zoo evaluates, films and uploads with the arguments of its command line, which args.yml has."""
+    settings = "{policy: MlpPolicy, n_timesteps: 20, learning_starts: 100, env_kwargs: {sutton_barto_reward: true}}"
+    (tmp_path / "mine.yml").write_text(f"CartPole-v1: {settings}")
+    sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 --conf-file {tmp_path}/mine.yml --eval-freq 10 -f {tmp_path}/logs")
+    run = tmp_path / "logs" / "eqr_qrdqn" / "CartPole-v1_1"
+    assert yaml.unsafe_load((run / "CartPole-v1" / "args.yml").read_text())["env_kwargs"] == {"sutton_barto_reward": True}
+    assert set(np.unique(np.load(run / "evaluations.npz")["results"])) <= {-1.0, 0.0}  # not the number of steps
+
+
+def test_what_was_there_before_is_left_alone(sb3_eqr, tmp_path, monkeypatch):
+    """RL Zoo finds no earlier run in a folder with brackets, and reads statistics of VecNormalize in the current folder."""
+    run = tmp_path / "seeds[1-5]" / "eqr_qrdqn" / "CartPole-v1_1"
+    run.mkdir(parents=True)
+    (run / "CartPole-v1.zip").touch()
+    sb3_eqr(f"train --algo eqr_qrdqn --env CartPole-v1 -n 60 -f {tmp_path}/seeds[1-5] -params batch_size:0", code=2)
+    assert (run / "CartPole-v1.zip").is_file()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "CartPole-v1").mkdir()
+    (tmp_path / "CartPole-v1" / "vecnormalize.pkl").write_bytes(b"not a pickle")
+    sb3_eqr("train --algo eqr_qrdqn --env CartPole-v1 -n 10 --eval-freq -1 -f logs")
+
+
 def test_wrappers_decide_which_entry_is_used(capfd):
     entries = {name: {} for name in ("default", "default-image", "default-small-image")}
     small = {"env_wrapper": [{"stable_baselines3.common.atari_wrappers.WarpFrame": {"width": 16, "height": 16}}]}

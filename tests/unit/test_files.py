@@ -1,7 +1,6 @@
 """Files and folders are complete or absent, even with several writers."""
 
 import errno
-import fcntl
 import functools
 import io
 import multiprocessing
@@ -64,6 +63,7 @@ def hang(path):
         time.sleep(60)
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="not on Windows")
 def test_partial_files_are_removed_unless_their_writer_is_running(tmp_path):
     path = tmp_path / "file.bin"
     context = multiprocessing.get_context("spawn")
@@ -126,7 +126,7 @@ def test_a_folder_appears_complete_and_is_not_replaced(tmp_path):
 
 def test_nothing_is_open_when_renamed_without_locks(tmp_path, monkeypatch):
     """On Windows there is no fcntl, a folder or read-only file cannot be flushed, and what is open cannot be renamed."""
-    moved = []
+    fcntl, moved = pytest.importorskip("fcntl"), []
 
     def move(source, destination, real):
         opened = [os.path.realpath(link.path) for link in os.scandir("/proc/self/fd") if os.path.exists(link.path)]
