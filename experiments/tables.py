@@ -58,18 +58,15 @@ OFF = {"EqR_Rainbow": "rainbow", "EqR_QRDQN": "qrdqn"}
 DEFAULTS, DEFAULTS_OFF = ("eqr_qrdqn:default", "eqr_qrdqn:plain"), ("eqr_rainbow:defaults", "eqr_rainbow:defaults_off")
 ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.jsonl.xz"]
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
+NOISE = ["continuous_early.xz", "continuous_short.xz"]
 EARLY = "area2000-12000", "continuous.md#in-12000-steps"  # after the random steps
 COMPARED: list[Arguments] = [
     *(
         (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("eqr_sac", "sac"), *EARLY)
-        for task in ("HalfCheetah", "Ant")
+        for task in ("HalfCheetah", "Ant", "Walker2d", "Hopper", "Humanoid")
     ),
-    *(  # the first version
-        (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("none", "sac"), *EARLY)
-        for task in ("Walker2d", "Hopper", "Humanoid")
-    ),
-    ("HalfCheetah, EqRTQC", ["continuous_early.xz"], ["HalfCheetah-v5"], ("none_tqc", "tqc"), *EARLY),
-    ("HalfCheetah with noise, EqRSAC", ["continuous_short.xz"], ["HalfCheetah-v5+noise"], ("none", "sac"), *EARLY),
+    ("HalfCheetah, EqRTQC", ["continuous_early.xz"], ["HalfCheetah-v5"], ("eqr_tqc", "tqc"), *EARLY),
+    ("HalfCheetah with noise, EqRSAC", NOISE, ["HalfCheetah-v5+noise"], ("eqr_sac", "sac"), *EARLY),
     ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
