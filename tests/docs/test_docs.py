@@ -9,6 +9,7 @@ Nothing else is replaced.
 
 import argparse
 import ast
+import functools
 import importlib
 import json
 import os
@@ -291,10 +292,12 @@ def shortened(monkeypatch, tmp_path):
         begin(self, *args, **kwargs)
         self.save_freq = min(self.save_freq, STEPS // 2)
 
+    record = sb3_eqr.visualize.record
+
+    @functools.wraps(record)
     def record_briefly(*args, **kwargs):
         return record(*args, **{**kwargs, "n_steps": 10})
 
-    record = sb3_eqr.visualize.record
     monkeypatch.setattr(sb3_eqr.visualize, "record", record_briefly)
     setup_model, begin = OnPolicyAlgorithm._setup_model, ExactCheckpointCallback.__init__
     monkeypatch.setattr(ExactCheckpointCallback, "__init__", check_often)
