@@ -2,8 +2,8 @@
 How well the features of an agent encode the state of an environment with a known symmetry: the fraction of variance (R²) of
 its positions that a linear probe explains, on held-out frames; for the trunk's features and, with a group, the latent state.
 
-    python -m experiments.probes worlds torus_of_8 --seeds 3 4
-    python -m experiments.probes worlds torus_of_4 --steps 8000
+    python -m experiments.probes torus_of_8 --seeds 3 4
+    python -m experiments.probes torus_of_4 --steps 8000
 """
 
 import argparse
@@ -93,8 +93,7 @@ def make(agent: str, game: str, seed: int, steps: int) -> Any:
 def main() -> None:
     """Parse the command line, train and probe, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suite", choices=["worlds"])
-    parser.add_argument("game", help="torus, large_torus, torus_of_4, torus_of_8 or pendulum")
+    parser.add_argument("game", help="of the suite worlds: torus, large_torus, torus_of_4, torus_of_8 or pendulum")
     parser.add_argument("--agent", default="eqr_qrdqn", help="of the benchmark")
     parser.add_argument("--steps", type=int, default=0, help="training steps; default: 0, untrained")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])

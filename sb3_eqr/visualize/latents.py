@@ -114,8 +114,9 @@ def play(
     factors: list[np.ndarray | None] = []
     with preserved_rng_state(model.action_space, env.action_space):
         obs = reset(model, env, seed)
-        both = env.observation_space, env.action_space
-        buffer = SequenceReplayBuffer(n_steps, *both, "cpu", n_envs=env.num_envs, prediction_depth=depth)
+        buffer = SequenceReplayBuffer(
+            n_steps, env.observation_space, env.action_space, "cpu", n_envs=env.num_envs, prediction_depth=depth
+        )
         infos: list[dict[str, Any]] = env.unwrapped.reset_infos
         for _ in range(buffer.buffer_size):
             factors.append(_factors(infos))
