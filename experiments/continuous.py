@@ -23,11 +23,13 @@ import numpy as np
 import torch as th
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
@@ -36,10 +38,11 @@ from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
 from sb3_eqr.benchmark.statistics import estimate, iqm
 from sb3_eqr.common.actor_critic import EqRActorCritic
+from sb3_eqr.common.augmentations import random_shift
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
 from sb3_eqr.common.saving.files import atomic_write
 
-PIXELS, N_TORQUES = "PixelPendulum-v0", 201
+PIXELS, N_TORQUES, SHIFT = "PixelPendulum-v0", 201, 3  # EqRSAC shifts images of 48 pixels by up to 3
 NOISE, N_NOISE = "+noise", 20  # what the name of a task ends with that has as many dimensions more
 COMPARED = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5"]
 TASKS = [*COMPARED, "HalfCheetah-v5+noise", PIXELS]
@@ -48,9 +51,18 @@ ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL 
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
 OTHERS = {
-    **dict.fromkeys(("sac", "sac_layer_norm", "sac_two_updates"), SAC),
+    **dict.fromkeys(("sac", "sac_layer_norm", "sac_two_updates", "sac_shift"), SAC),
     **{"tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC, "none_tqc": EqRTQC},
 }
+
+
+class ShiftedReplay(ReplayBuffer):
+    """SB3's replay buffer, whose images are shifted at random when they are sampled, as in DrQ."""
+
+    def _get_samples(self, *args: Any, **kwargs: Any) -> ReplayBufferSamples:
+        batch = super()._get_samples(*args, **kwargs)
+        shifted = {name: random_shift(getattr(batch, name), SHIFT) for name in ("observations", "next_observations")}
+        return batch._replace(**shifted)
 
 
 def first_version(group: str) -> dict[str, Any]:
@@ -62,6 +74,7 @@ def first_version(group: str) -> dict[str, Any]:
 ARMS: dict[str, dict[str, Any]] = {
     **{name: {} for name in OTHERS},
     "sac_two_updates": {"gradient_steps": 2},
+    "sac_shift": {"replay_buffer_class": ShiftedReplay},
     "eqr_sac": {},
     "no_losses": {"prediction_depth": 0},
     "none": first_version("none(72)"),
