@@ -349,7 +349,8 @@ def main() -> None:
         with atomic_write(args.pack, "xz") as out:
             out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
-        draw(rows(runs, [args.drawn, "sac"]), "return", args.figure, ["EqRSAC", "SAC"])
+        label = {"eqr_sac": "EqRSAC", "none": "EqRSAC, first version"}.get(args.drawn, args.drawn)
+        draw(rows(runs, [args.drawn, "sac"]), "return", args.figure, [label, "SAC"])
     print(report(runs, args.to, args.after, args.cost, args.until, args.greedy))
 
 

@@ -237,12 +237,13 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
     return markdown(header, lines)
 
 
-def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | None = None) -> None:
+def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | None = None, axis_label: str = "") -> None:
     """
     Draw a series along training, a panel per game: means over seeds, and their 95% intervals as a band.
 
     :param what: see :func:`series`
     :param labels: of the agents, in order of appearance (default: their names)
+    :param axis_label: in place of that of ``AXES``
     """
     games, agents = unique(rows, "game"), unique(rows, "agent")
     n_columns, n_rows = min(len(games), 2), (len(games) + 1) // 2
@@ -269,7 +270,7 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
             axis.set_axis_off()
         lines = {str(line.get_label()): line for axis in axes.flat for line in axis.get_lines()}
         figure.supxlabel("training steps (thousands)", fontsize="medium")
-        figure.supylabel(AXES.get(what, what), fontsize="medium")
+        figure.supylabel(axis_label or AXES.get(what, what), fontsize="medium")
         figure.legend(list(lines.values()), list(lines), loc="outside upper center")
         figure.savefig(path, dpi=DPI, metadata={"Software": None})
         plt.close(figure)
@@ -431,6 +432,7 @@ def main() -> None:
     drawn = "draw return, goals, aet_loss, ... along training"
     parser.add_argument("--figure", nargs=2, metavar=("SERIES", "FILE"), help=drawn)
     parser.add_argument("--labels", nargs="+", help="of the agents in the figure, in words")
+    parser.add_argument("--axis-label", default="", help="of the figure's vertical axis")
     every = "a file: draw what EqR changes on every task of COMPARED, whose runs are in the given folder, and print a table"
     parser.add_argument("--differences", type=pathlib.Path, metavar="FILE", help=every)
     units = "print the difference of two agents in units of SPR's published standard deviation, game by game"
@@ -459,7 +461,7 @@ def main() -> None:
     if args.claim:
         print(claim(rows, (full[args.claim[0]], full[args.claim[1]]), args.games or unique(rows, "game")))
     elif args.figure:
-        draw(rows, args.figure[0], pathlib.Path(args.figure[1]), args.labels)
+        draw(rows, args.figure[0], pathlib.Path(args.figure[1]), args.labels, args.axis_label)
     else:
         print(table(rows, args.measures, full.get(args.baseline, args.baseline), args.ratio, args.each))
 

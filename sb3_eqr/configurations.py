@@ -32,10 +32,10 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         EqRRainbow("CnnPolicy", env, **load_configuration("eqr_bbf", policy_kwargs=narrow, learning_starts=500))
 
     :param name: one of ``sb3_eqr.configurations.configuration_files()``; docs/choosing.md describes each one
-    :param env_id: the entry in that file: "atari", or the name of an environment
+    :param env_id: the section of that file: "atari", or the name of an environment
     :param changes: arguments that override those of the file; dictionaries are merged
-    :return: the arguments, without what RL Zoo itself reads (``ZOO_KEYS``); warns if the entry's environment is normalised
-    :raises ValueError: if the file or the entry does not exist
+    :return: the arguments, without what RL Zoo itself reads (``ZOO_KEYS``); warns if the section's environment is normalised
+    :raises ValueError: if the file or the section does not exist
     """
     try:
         import yaml
@@ -46,9 +46,9 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.{nearest(name, files)}")
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
-        default = ' Any other environment has the entry "default".' if "default" in entries else ""
+        default = ' Any other environment has the section "default".' if "default" in entries else ""
         raise ValueError(
-            f"env_id must be one of the entries {list(entries)} of configuration {name!r}, got {env_id!r}.{default}"
+            f"env_id must be one of the sections {list(entries)} of configuration {name!r}, got {env_id!r}.{default}"
         )
     if normalize := entries[env_id].get("normalize"):
         warnings.warn(

@@ -131,13 +131,13 @@ def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces
     if isinstance(written.get("policy_kwargs"), str) and "policy_kwargs" in agent.changes:
         raise ValueError(
             f"{where}: policy_kwargs must be a mapping in {agent.file.name}, so that changes can be merged into it, got text. "
-            "Copy the entry into a file of your own."
+            "Copy the section into a file of your own."
         )
     entry = merged(written, agent.changes)
     check_entry(merged(read_entry(str(agent.file), env_id, changes), agent.changes), agent.algo, str(agent.file))
     if own := [key for key in WORLD if entry.get(key) is not None and (key not in preprocessing or key in agent.changes)]:
         raise ValueError(
-            f"{where}: the entry must not change the suite's environment, got its own {', '.join(own)}. "
+            f"{where}: the section must not change the suite's environment, got its own {', '.join(own)}. "
             "Set it under preprocessing in the suite (null for none), so that all agents have the same environment."
         )
     kind = "discrete" if isinstance(action_space, spaces.Discrete) else "continuous"

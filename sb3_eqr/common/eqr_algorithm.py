@@ -91,7 +91,7 @@ class EqRAlgorithm(EqROffPolicy):
     ):
         """
         The defaults are the paper's hyperparameters for Atari 100K (Table 5; losses are sums over 5 steps there, means here),
-        except for those of docs/gradients.md, "Which defaults matter".
+        except for those of docs/differences.md.
 
         :param policy: The policy model to use, by its name ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") or its class
         :param env: The environment to learn from (if registered in Gym, can be str); actions must be Discrete

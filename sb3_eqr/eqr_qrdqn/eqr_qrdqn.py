@@ -14,8 +14,8 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     the quantile head is from https://arxiv.org/abs/1710.10044.
 
     The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRQRDQN.__init__)``). The
-    defaults are the paper's values for Atari 100K (Table 5), except for those of docs/gradients.md, "Which defaults matter",
-    and where QR-DQN differs: 51 quantiles replace the 51 atoms on [-10, 10], and the priority is the quantile loss.
+    defaults are the paper's values for Atari 100K (Table 5), except for those of docs/differences.md, and
+    where QR-DQN differs: 51 quantiles replace the 51 atoms on [-10, 10], and the priority is the quantile loss.
 
     ``policy_kwargs`` sets the group, the number of blocks, dueling and noisy layers, see
     :class:`~sb3_eqr.eqr_qrdqn.policies.EqRQRDQNPolicy`.

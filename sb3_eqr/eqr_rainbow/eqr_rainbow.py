@@ -21,7 +21,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     layers, prioritised replay and n-step returns from https://arxiv.org/abs/1710.02298.
 
     The parameters are those of :class:`~sb3_eqr.common.eqr_algorithm.EqRAlgorithm` (``help(EqRRainbow.__init__)``). The
-    defaults are the paper's values for Atari 100K (Table 5), except for those of docs/gradients.md, "Which defaults matter".
+    defaults are the paper's values for Atari 100K (Table 5), except for those of docs/differences.md.
 
     ``policy_kwargs`` sets the support of the return distribution (``n_atoms``, ``v_min``, ``v_max``), the group, the number
     of blocks, dueling and noisy layers, see :class:`~sb3_eqr.eqr_rainbow.policies.EqRRainbowPolicy`. The default support

@@ -113,13 +113,13 @@ def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any
     entries = read_file(path)
     name = entry_name(entries, env_id, changes)
     if name not in entries:
-        fail(f"{path} has no entry for {env_id!r}, only for {', '.join(entries) or 'none'}. Add one, or use another file.")
+        fail(f"{path} has no section for {env_id!r}, only for {', '.join(entries) or 'none'}. Add one, or use another file.")
     if not isinstance(entries[name] or {}, dict):
         fail(f"{path}: {name} must be a mapping of hyperparameters, got {entries[name]!r:.60}.")
     entry = {**(entries[name] or {}), **changes}
     for key in ("policy", "n_timesteps"):
         if key not in entry:
-            fail(f"{path}: the entry {name!r} needs {key!r}.")
+            fail(f"{path}: the section {name!r} needs {key!r}.")
     return entry
 
 

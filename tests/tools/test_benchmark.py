@@ -184,7 +184,7 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite smoke --agents sac", "sac does not support discrete actions"),
         ("run b --suite smoke --agents ppo --steps 2001", "steps must be a multiple of n_envs = 8, got 2001"),
         ("run b --suite smoke --agents eqr_rainbow:se2+ate", "no hyperparameters 'se2+ate'. Did you mean 'se2+aet'?"),
-        ("run b --suite minatar --agents eqr_rainbow:der", "no entry for 'MinAtar/Asterix-v1'"),
+        ("run b --suite minatar --agents eqr_rainbow:der", "no section for 'MinAtar/Asterix-v1'"),
         ("run b --suite smoke --agents dqn dqn", "--agents must be different agents, got dqn more than once"),
         ("run b --suite smoke", "--suite and --agents must be given together"),
         ("run b", "got one without runs"),

@@ -227,7 +227,7 @@ def check_normalization(normalize: VecNormalize | None, observation_space: space
         raise ValueError(
             f"VecNormalize must be outside all wrappers that change observations, so that it can return the original ones, "
             f"got {normalize.observation_space} from VecNormalize and {observation_space} outside. "
-            "Use VecNormalize(VecTransposeImage(env)) for images; on RL Zoo's command line, leave out normalize for them."
+            "Use VecNormalize(VecTransposeImage(env), norm_obs=False) for images; with RL Zoo, leave out normalize for them."
         )
 
 
