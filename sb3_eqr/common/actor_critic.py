@@ -1,7 +1,7 @@
 """The algorithm of actor-critic agents with a latent model: before each update of SB3's, the latent model makes one."""
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -129,11 +129,27 @@ class EqRActorCritic(EqROffPolicy):
             self.replay_buffer = BeforeSamples(buffer, self._update_latent_model, self.latent_batch_size or batch_size)  # type: ignore[assignment]
         with policy.reader.updating() if policy.has_latent else nullcontext():
             try:
-                super().train(gradient_steps, batch_size)  # type: ignore[misc]
+                with self._infinity_named():
+                    super().train(gradient_steps, batch_size)  # type: ignore[misc]
             finally:
                 self.replay_buffer = buffer
         recorded = self.logger.name_to_value
-        self._monitor.check_losses({name: recorded[name] for name in LOSSES if name in recorded}, self._n_updates)
+        with self._step_named():
+            self._monitor.check_losses({name: recorded[name] for name in LOSSES if name in recorded}, self._n_updates)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
+        """As SB3's ``collect_rollouts``; raises FloatingPointError if an update made the networks infinite or NaN."""
+        with self._infinity_named():
+            return super().collect_rollouts(*args, **kwargs)
+
+    @contextmanager
+    def _infinity_named(self) -> Iterator[None]:
+        """PyTorch's distributions raise ValueError if the networks are not finite: raise the error of the update instead."""
+        try:
+            yield
+        except ValueError:
+            self._log_last_round(check_model=True)
+            raise
 
     def _update_latent_model(self, samples: SequenceReplayBufferSamples) -> None:
         """One update of encoder and latent model, and of their moving averages."""

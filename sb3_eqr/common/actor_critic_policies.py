@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel, BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -19,12 +19,12 @@ from sb3_eqr.common.checks.arguments import (
     FLAG,
     NONE,
     POLICY,
-    SHARE,
     TEXT,
     Rule,
     a,
     check_arguments,
     integer,
+    number,
     one_of,
     option,
     with_fields_of,
@@ -48,6 +48,7 @@ from sb3_eqr.common.networks.optimizers import can_fuse, find_optimizer
 from sb3_eqr.common.networks.target_copy import TargetCopy
 from sb3_eqr.common.type_aliases import PyTorchObs
 
+DEFAULT_SHIFT = 4  # pixels, as in DrQ
 GROUP = TEXT | a(Group, "a group")
 NET_ARCH = Rule(
     'a dictionary with the lists "pi" and "qf"', lambda value: isinstance(value, dict) and {*value} == {"pi", "qf"}
@@ -72,7 +73,7 @@ class ActorCriticOptions(LatentOptions):
 
     group: str | Group = option("T(72)^1", GROUP)  # type: ignore[assignment]  # noqa: RUF009
     transition: str = option("group", one_of(["group"]))
-    latent_tau: float | None = option(0.005, SHARE)
+    latent_tau: float | None = option(0.005, number(0, 1, above=True))
     projection: str = option("own", one_of(["own", "none"]))
 
     def __post_init__(self) -> None:
@@ -97,15 +98,15 @@ class ActorCriticOptions(LatentOptions):
 
 class LatentReader(BaseFeaturesExtractor):
     """
-    What actor and critics read of observations: [s, x] of vectors, [h(s), x] of all others, or as ``reads_features`` says. h
-    and x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In a round of
-    updates, observations are augmented, and those of one batch are encoded only once, for actor and critics alike.
+    What actor and critics read of observations: [s, x], but h(s) in place of images, or as ``reads_features`` says. h and
+    x = τ(s) are those of the moving average, without gradient: only the auxiliary losses train them. In a round of updates,
+    observations are augmented, and those of one batch are encoded only once, for actor and critics alike.
 
     :param observation_space: of the observations
     :param encoder: the moving average of the encoder, h
     :param latent_model: the moving average of the latent model
     :param augment: in a round of updates; otherwise observations are only preprocessed
-    :param reads_features: whether h(s) is among what they read; ``None``: only if s is not a vector
+    :param reads_features: whether h(s) is among what they read; ``None``: only if s has images
     """
 
     def __init__(
@@ -116,9 +117,8 @@ class LatentReader(BaseFeaturesExtractor):
         augment: Augmentation,
         reads_features: bool | None = None,
     ):
-        self.is_vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
-        n_observed = observation_space.shape[0] if self.is_vector else 0  # type: ignore[index]
-        self.reads_features = not self.is_vector if reads_features is None else reads_features
+        n_observed = sum(get_flattened_obs_dim(space) for space in augment.plain_spaces.values())
+        self.reads_features = bool(augment.image_keys) if reads_features is None else reads_features
         n_features = encoder.features_dim if self.reads_features else 0
         super().__init__(observation_space, n_observed + n_features + latent_model.state_dim)
         self._parts = encoder, latent_model  # in a tuple: they belong to the policy
@@ -142,7 +142,8 @@ class LatentReader(BaseFeaturesExtractor):
     def _read(self, observations: PyTorchObs) -> th.Tensor:
         encoder, latent_model = self._parts
         features = encoder(observations)
-        parts: list[Any] = [observations] if self.is_vector else []
+        given = observations if isinstance(observations, dict) else {"": observations}
+        parts = [given[key].flatten(1) for key in self._augment.plain_spaces]
         parts += [features] if self.reads_features else []
         return th.cat([*parts, latent_model.embedding(features)], dim=1)
 
@@ -222,8 +223,8 @@ class EqRActorCriticPolicy(BasePolicy):
         ``head_input="observation"``
     :param features_extractor_kwargs: its keyword arguments
     :param layer_norm: whether layer norm follows the encoder
-    :param reads_features: whether actor and critics read h(s) beside x and, of vectors, s; ``None``: only if s is
-        not a vector
+    :param reads_features: whether actor and critics read h(s) beside x and what of s is not an image; ``None``: only if s
+        has images
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
     :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
         (https://arxiv.org/abs/2004.13649)
@@ -255,7 +256,7 @@ class EqRActorCriticPolicy(BasePolicy):
         layer_norm: bool = True,
         head_input: str = "latent",
         reads_features: bool | None = None,
-        shift_pixels: int = 4,
+        shift_pixels: int = DEFAULT_SHIFT,
         **kwargs: Any,
     ):
         check_arguments({**kwargs, **locals()}, RULES)
@@ -266,6 +267,11 @@ class EqRActorCriticPolicy(BasePolicy):
         self.head_input = head_input
         self.reads_features = reads_features
         self.shift_pixels = shift_pixels
+        if not self.has_latent:
+            unused = [found.name for found in fields(self.options) if getattr(self.options, found.name) != found.default]
+            unused += [] if shift_pixels in (0, DEFAULT_SHIFT) else ["shift_pixels"]
+            if unused:
+                warnings.warn(f"{', '.join(unused)}: no effect with head_input='observation', without a latent model.")
         kind = kwargs["optimizer_class"] = find_optimizer(kwargs.get("optimizer_class", th.optim.Adam))
         if self.has_latent and kind in (th.optim.Adam, th.optim.AdamW):
             given = kwargs.get("optimizer_kwargs") or {}

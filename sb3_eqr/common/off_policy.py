@@ -3,7 +3,8 @@
 import copy
 import inspect
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -120,12 +121,18 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _log_last_round(self, check_model: bool = False) -> None:
         """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
-        try:
+        with self._step_named():
             for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
                 for name, value in update.items():
                     self.logger.record_mean(f"train/{name}", value)
             if check_model:
                 self._monitor.check_model(self._n_updates)
+
+    @contextmanager
+    def _step_named(self) -> Iterator[None]:
+        """Add the step to errors of the monitor."""
+        try:
+            yield
         except FloatingPointError as error:
             raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
 

@@ -93,6 +93,8 @@ def convert_actor_critic_params(sampled: dict[str, Any], stock: str, kept: dict[
 def with_latent_params(stock: dict[str, Any], own: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
     """Keyword arguments of the stock algorithm and of the latent model together."""
     policy_kwargs = {**kept, **stock["policy_kwargs"], "group": own["group"]}
+    if "^" in own["group"]:  # which has its number of blocks
+        policy_kwargs.pop("n_blocks", None)
     return {**stock, **{name: value for name, value in own.items() if name != "group"}, "policy_kwargs": policy_kwargs}
 
 

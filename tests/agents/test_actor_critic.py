@@ -59,6 +59,12 @@ class MoveEnv(gym.Env):
         return self.observe(), float(self.place[0]), is_outside, self.time >= 20, {}
 
 
+class SampledEnv(MoveEnv):
+    def observe(self):
+        super().observe()
+        return self.observation_space.sample()
+
+
 IMAGE = spaces.Box(0, 255, (3, 40, 40), np.uint8)
 DICT = spaces.Dict({"image": IMAGE, "place": BOX})
 
@@ -115,6 +121,21 @@ def test_by_default_the_element_of_the_action_is_added(agent):
 
 
 @EACH
+def test_actor_and_critics_read_the_numbers_of_a_dict_as_they_are(agent):
+    """In place of the image they read h(s); a number of Discrete(3) is one-hot."""
+    space = spaces.Dict({"goal": spaces.Discrete(3), "image": IMAGE, "place": spaces.Box(-1, 1, (2, 2))})
+    policy = make(agent, SampledEnv(space), "MultiInputPolicy").policy
+    policy.set_training_mode(False)
+    found = {"goal": th.tensor([2, 0]), "image": th.zeros(2, 3, 40, 40, dtype=th.uint8), "place": th.rand(2, 2, 2)}
+    read = policy.actor.extract_features(found, policy.actor.features_extractor)
+    assert th.equal(read[:, :3], th.eye(3)[[2, 0]]) and th.equal(read[:, 3:7], found["place"].flatten(1))
+    one_hot = {"goal": th.eye(3)[[2, 0]], "image": found["image"].float(), "place": found["place"]}
+    assert th.allclose(read[:, 7:-18], policy.latent_encoder(one_hot)) and policy.latent_target.state_dim == 18
+    vectors = spaces.Dict({"goal": spaces.Discrete(3), "place": BOX})
+    assert make(agent, SampledEnv(vectors), "MultiInputPolicy").policy.actor.features_dim == 3 + 3 + 18
+
+
+@EACH
 @pytest.mark.parametrize("reads_features", [None, False, True])
 def test_actor_and_critics_read_the_moving_average(agent, reads_features):
     model = make(agent, policy_kwargs={"reads_features": reads_features}).learn(60)
@@ -144,7 +165,7 @@ def test_actor_and_critics_read_the_moving_average(agent, reads_features):
 def test_features_are_read_where_the_observation_is_not(agent):
     for env, kind in ((BOX, "MlpPolicy"), (IMAGE, "CnnPolicy"), (IMAGE, "MlpPolicy"), (DICT, "MultiInputPolicy")):
         policy = make(agent, MoveEnv(env), kind).policy
-        n_read = 3 if env is BOX else policy.encoder.features_dim
+        n_read = (0 if env is BOX else policy.encoder.features_dim) + (0 if env is IMAGE else 3)
         assert policy.actor.features_extractor.features_dim == n_read + 3 * 6, (env, kind)
 
 
@@ -391,8 +412,30 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, env, tmp_path):
     make(agent, env).learn(70, callback=ExactCheckpointCallback(60, tmp_path))
     resumed = agent.resume(tmp_path, make(agent, env).get_env())
     assert resumed.num_timesteps == 60
-    resumed.learn(30, reset_num_timesteps=False)
+    resumed.learn(30, callback=ExactCheckpointCallback(20, tmp_path), reset_num_timesteps=False)
     assert same(whole, resumed)
+
+
+@EACH
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_noise_begins_anew_when_a_callback_stops_the_training_at_an_episodes_end(agent, n_envs):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))
+    model = make(agent, make_vec_env(MoveEnv, n_envs, seed=0), action_noise=noise, learning_starts=1_000)
+    model.learn(1_000, callback=lambda found, _: not found["dones"][-1])
+    left = model.action_noise.noises[-1] if n_envs > 1 else model.action_noise
+    assert not left.noise_prev.any()
+
+
+@EACH
+@pytest.mark.parametrize("part", ["encoder", "latent_target", "actor"])
+def test_networks_that_are_not_finite_raise(agent, part):
+    """In a round of two updates, before SB3's own error about a distribution."""
+    model = make(agent, gradient_steps=2).learn(32)
+    with th.no_grad():
+        for parameter in getattr(model.policy, part).parameters():
+            parameter.fill_(th.nan)
+    with pytest.raises(FloatingPointError, match=r"step 3[23], update \d+: (losses|parameters) must be finite, got "):
+        model.learn(1, reset_num_timesteps=False)
 
 
 @EACH
@@ -401,10 +444,23 @@ def test_losses_of_the_critics_that_are_not_finite_raise(agent, off, tmp_path):
     model = make(agent, ent_coef=0.1, **off).learn(32)
     with th.no_grad():
         next(model.critic.qf0.parameters() if hasattr(model.critic, "qf0") else model.critic.parameters()).fill_(th.nan)
-    with pytest.raises(FloatingPointError, match=r"update \d+: losses must be finite, got .*critic_loss = nan"):
+    with pytest.raises(FloatingPointError, match=r"step 33, update \d+: losses must be finite, got .*critic_loss = nan"):
         model.learn(1, reset_num_timesteps=False)
     with pytest.raises(FloatingPointError):
         model.save(tmp_path / "model")
+
+
+@EACH
+def test_a_run_continues_in_an_environment_that_is_also_rendered(agent, tmp_path):
+    """SB3 gives a render mode to environments that it makes; gymnasium does not."""
+    make(agent, "Pendulum-v1").learn(40, callback=ExactCheckpointCallback(30, tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        agent.resume(tmp_path, gym.make("Pendulum-v1"))
+    with pytest.warns(UserWarning, match="other arguments than before: kwargs = {} there, {'g': 9.0} here"):
+        model = agent.resume(tmp_path, gym.make("Pendulum-v1", g=9.0))
+    model.learn(20, callback=ExactCheckpointCallback(10, tmp_path), reset_num_timesteps=False)
+    assert max(found.name for found in tmp_path.iterdir()) == "checkpoint-000000000040"
 
 
 @EACH
@@ -425,6 +481,11 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"policy_kwargs": {"head_input": "observation"}}, "prediction_depth must be 0 with head_input='observation'"),
         ({"policy_kwargs": {"head_input": "trunk"}}, "head_input must be one of .*'latent', 'observation'.*, got 'trunk'"),
         ({"policy_kwargs": {"group": None}}, "group must be"),
+        ({"policy_kwargs": {"latent_tau": 0}}, r"latent_tau must be a finite number in \(0, 1\], got 0"),
+        (
+            {"policy_kwargs": {"group": "none(8) x SE(2)", "n_blocks": None, "state_dependent_actions": False}},
+            "state_dependent_actions must be True without a group",
+        ),
         ({"policy_kwargs": {"group": "T(72)^1", "n_blocks": 3}}, "n_blocks must be None with group='T"),
         ({"policy_kwargs": {"group": "none(72)", "n_blocks": 3}}, "n_blocks must be None or 1 without a group, got 3"),
         (

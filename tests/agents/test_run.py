@@ -421,6 +421,20 @@ def test_the_step_at_which_a_callback_stops_learn_is_stored(make, kind):
 
 
 @EITHER
+def test_errors_of_callbacks_are_not_the_environments(make):
+    class Short(ChainEnv):
+        def step(self, action):
+            return super().step(action)[:4]
+
+    with pytest.raises(AttributeError, match="no_such_method"):
+        make(ChainEnv()).learn(10, callback=lambda found, _: found["env"].env_method("no_such_method"))
+    with pytest.raises(
+        ValueError, match="step 0: the environment must follow gymnasium's interface, got ValueError: not enough"
+    ):
+        make(Short()).learn(10)
+
+
+@EITHER
 def test_episodes_that_end_the_training_are_counted(make):
     """``StopTrainingOnMaxEpisodes`` ends twenty calls of ``learn``, each with the last step of an episode."""
     model = make(ImageEnv(length=5), "CnnPolicy", learning_starts=1_000)

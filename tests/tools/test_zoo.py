@@ -352,7 +352,7 @@ def test_configurations_by_name_and_stock_algorithms():
 @pytest.mark.parametrize("name", zoo.AGENTS)
 def test_the_search_space_makes_agents(name):
     """Every sample of parameters builds an agent, and the converter restores the sample from the study."""
-    zoo.register(policy_kwargs={"log_std": 1, "group": "T(2)"})  # the first is kept, the second is replaced by the search
+    zoo.register(policy_kwargs={"log_std": 1, "group": "T(2)", "n_blocks": 4})  # the search keeps the first, not the second
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     groups = set()
     for _ in range(8):

@@ -488,6 +488,6 @@ def test_frames_in_a_tensor_equal_those_in_an_array(device):
 
 def test_frames_that_a_gpu_has_no_room_for_stay_in_the_computer(monkeypatch):
     monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (1000, 2000))
-    with pytest.warns(UserWarning, match=r"need 0.00 GB, and cuda has 0.00 GB left, so they stay"):
+    with pytest.warns(UserWarning, match=r"need 0.00 GB, and cuda has 0.00 GB left, also for updates, so they stay"):
         store = FrameStore(40, 1, (4, 84, 84), np.dtype(np.uint8), 4, "cuda")
     assert isinstance(store._frames, np.ndarray)

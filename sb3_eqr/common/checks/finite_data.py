@@ -60,6 +60,8 @@ class FiniteData(OffPolicyAlgorithm):
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         self._on_step()
         self._episode_num += int(seen["dones"].sum())
+        if self.action_noise is not None and seen["dones"].any():
+            self.action_noise.reset(**({"indices": np.flatnonzero(seen["dones"])} if self.n_envs > 1 else {}))
 
     def _warn_without_normalization(self) -> None:
         """Warn if an agent trained with VecNormalize would now get raw observations, with which its actions are useless."""

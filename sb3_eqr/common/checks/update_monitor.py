@@ -60,5 +60,5 @@ class UpdateMonitor:
     def _refuse(self, update: int, what: str, found: str) -> NoReturn:
         raise FloatingPointError(
             f"update {update}: {what} must be finite, got {found}. The model is spoilt and cannot be saved: load the last "
-            "checkpoint, and lower learning_rate or max_grad_norm, or check the scale of observations and rewards."
+            "checkpoint, and lower learning_rate, or check the scale of observations and rewards."
         )

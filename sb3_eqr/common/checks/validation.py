@@ -19,6 +19,7 @@ from sb3_eqr.common.checks.arguments import ALGORITHM, POLICY, nearest
 
 P = ParamSpec("P")
 LARGEST = float(np.finfo(np.float32).max)
+CALLBACKS = "stable_baselines3/common/callbacks.py"  # which calls those of users
 # Code that processes the values that an environment returns.
 CONSUMERS = ("stable_baselines3/common/vec_env/", "stable_baselines3/common/monitor", "/gymnasium/")
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "sum")  # of PyTorch's fused optimisers
@@ -29,13 +30,14 @@ OF_ENV = ("observation_space", "action_space", "n_envs")  # arguments of replay 
 def environment_errors(step: int) -> Iterator[None]:
     """
     An environment that violates gymnasium's interface causes errors in the code that processes the values it returns. Replace
-    them by a ValueError that names the environment as the cause; errors of the environment's own code are unchanged.
+    them by a ValueError that names the environment as the cause; errors of its own code, and of
+    callbacks, are unchanged.
     """
     try:
         yield
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        innermost = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename).as_posix()
-        if not any(name in innermost for name in CONSUMERS):
+        files = [pathlib.Path(frame.filename).as_posix() for frame in traceback.extract_tb(error.__traceback__)]
+        if any(name.endswith(CALLBACKS) for name in files) or not any(name in files[-1] for name in CONSUMERS):
             raise
         raise ValueError(
             f"step {step}: the environment must follow gymnasium's interface, got {type(error).__name__}: {error}. "

@@ -15,7 +15,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_eqr.common.groups import Group, NoGroup
+from sb3_eqr.common.groups import Group
 from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.losses import contrastive_loss, normalized_distance, reward_cross_entropy, reward_mse
 
@@ -81,7 +81,7 @@ class LatentModel(nn.Module):
         n_params = self.n_blocks * self.group.num_params
         if self.options.state_dependent_actions:
             self.transition = hidden_layer(self.state_dim + self.action_dim, width, n_params, norm)  # κ(x, a)
-        elif isinstance(self.group, NoGroup):
+        elif not self.group.has_inverse:
             raise ValueError(
                 "state_dependent_actions must be True without a group, where κ(s, a) alone predicts the next state, got "
                 'False. Pass a group such as group="SE(2)".'

@@ -31,6 +31,7 @@ class Augmentation:
         is_dict = isinstance(observation_space, spaces.Dict)
         self._spaces = observation_space.spaces if is_dict else {"": observation_space}  # type: ignore[attr-defined]
         self.image_keys = [k for k, s in self._spaces.items() if is_image_space(s, normalized_image=not normalize_images)]
+        self.plain_spaces = {key: s for key, s in self._spaces.items() if key not in self.image_keys}
         self._normalize_images = normalize_images
         sides = {key: min(self._spaces[key].shape[-2:]) for key in self.image_keys}  # type: ignore[index]
         self.shifts = {key: min(shift_pixels, side // self.SIDE_PER_PIXEL) for key, side in sides.items()}

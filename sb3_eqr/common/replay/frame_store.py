@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+SHARE_OF_GPU = 0.8  # of its free memory that frames may take; updates need the rest
 _ZERO = 0  # slot 0 always holds the zeros with which VecFrameStack pads the first observations of an episode
 
 
@@ -55,12 +56,13 @@ class FrameStore:
         self._frames: np.ndarray | th.Tensor = frames  # a tensor on a GPU
         if self.device.type == "cuda":
             free, _ = th.cuda.mem_get_info(self.device)
-            if frames.nbytes < free:
+            if frames.nbytes < SHARE_OF_GPU * free:
                 self._frames = th.zeros_like(th.from_numpy(frames), device=self.device)
             else:
                 warnings.warn(
                     f"The frames of the replay buffer need {frames.nbytes / 1e9:.2f} GB, and {self.device} has "
-                    f"{free / 1e9:.2f} GB left, so they stay in the computer's memory. Pass a smaller buffer_size."
+                    f"{free / 1e9:.2f} GB left, also for updates, so they stay in the computer's memory. Pass a smaller "
+                    "buffer_size."
                 )
 
     def emptied(self) -> "FrameStore":

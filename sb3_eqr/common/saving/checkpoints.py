@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
@@ -82,7 +83,9 @@ def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
     """The arguments of an agent, its spaces and its environment as plain data, to distinguish its run from others."""
     of_sac = ("ent_coef", "target_entropy", "use_sde", "sde_sample_freq", "use_sde_at_warmup")  # which have no rule
     names = [name for name in (*getattr(model, "rules", ALGORITHM), *of_sac) if name not in ("verbose", "tensorboard_log")]
-    found = {name: without_pickles(encode(getattr(model, name))) for name in names if hasattr(model, name)}
+    values = {name: getattr(model, name) for name in names if hasattr(model, name)}
+    # TQC's target_entropy is a NumPy number at first, and a float after the model was loaded
+    found = {k: without_pickles(encode(v.item() if isinstance(v, np.generic) else v)) for k, v in values.items()}
     spaces = {"observation_space": repr(model.observation_space), "action_space": repr(model.action_space)}
     return {**found, "resets": encode(getattr(model, "resets", None)), **spaces, "environment": environment_of(model)}
 
@@ -95,7 +98,8 @@ def environment_of(model: BaseAlgorithm) -> dict[str, Any]:
     env, spec = innermost.envs[0].unwrapped, innermost.envs[0].spec
     if spec is None:
         return {"id": type(env).__name__}
-    return {"id": spec.id, "max_episode_steps": spec.max_episode_steps, "kwargs": without_pickles(encode(spec.kwargs))}
+    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}  # SB3 sets it in what it makes
+    return {"id": spec.id, "max_episode_steps": spec.max_episode_steps, "kwargs": without_pickles(encode(kwargs))}
 
 
 @contextmanager
@@ -240,8 +244,10 @@ class ExactCheckpointCallback(BaseCallback):
         warn_of_noise(self.model)
         manifest = self._last_manifest()
         theirs, ours = manifest.get("settings", {}), settings_of(self.model)
-        other = [name for name in theirs if theirs[name] != ours.get(name)]
         step, last = self.model.num_timesteps, manifest.get("num_timesteps", 0)
+        if step > 0 and theirs:  # resume has warned of other arguments of the environment
+            theirs, ours = ({**found, "environment": found["environment"].get("id")} for found in (theirs, ours))
+        other = [name for name in theirs if theirs[name] != ours.get(name)]
         # An earlier call of learn with this callback may have ended where a checkpoint was due.
         self._last = last // self.save_freq if 0 < last <= step else min(self._last, step // self.save_freq)
         if other:
