@@ -150,7 +150,7 @@ def draw(model: EqRQRDQN, world: SlidingBall, path: pathlib.Path) -> None:
             every = along[:: GRID["ball"] // 8]  # eight positions
             angles = 2 * np.pi * turns(model, encode(model, images(world, along)))
             eight = 2 * np.pi * turns(model, encode(model, images(world, every)))
-            shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (0, 0), (2, 2)), constant_values=255)  # (8, h, w)
+            shown = np.pad(images(world, every)[:, 0].numpy(), ((0, 0), (0, 0), (2, 2)), constant_values=150)  # (8, h, w)
             strip = figure.add_subplot(grids[2 * axis, :])
             strip.imshow(np.concatenate(list(shown), axis=1), cmap="gray")
             strip.set_title(f"{AXES[axis]} motion, 0 to 7")
