@@ -95,6 +95,7 @@ def draw_curves(axes: Any, curves: dict[str, tuple[list[int], list[float]]], ste
             band = scores.min(axis=0), scores.max(axis=0)
             axes.fill_between(runs[0]["step"], *band, color=look.color, alpha=0.15, linewidth=0)
     axes.set(xlabel="training steps", ylabel="return in training", xlim=(0, steps), xticks=range(0, steps + 1, 4_000))
+    axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.margins(y=0.08)
     axes.legend(loc="upper left")
     axes.grid()
@@ -116,7 +117,7 @@ def draw(runs: dict[str, Run], curves: dict[str, tuple[list[int], list[float]]],
             axes.axhline(0, color=GREY, linewidth=1)
             bodies[name] = axes.add_collection(LineCollection([], colors=look.color, capstyle="round"))
             labels[name] = axes.text(-HALF_WIDTH, HEIGHT, "", va="top", color=INK)
-            marks[name] = [axes.text(0, -0.04, "", ha="center", va="top", color=INK, fontsize=15) for _ in range(7)]
+            marks[name] = [axes.text(0, -0.04, "", ha="center", va="top", color=INK) for _ in range(7)]
 
         def frame(t: int) -> list[Any]:
             for name, found in runs.items():
