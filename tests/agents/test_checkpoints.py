@@ -47,6 +47,7 @@ def resume(folder):
         model.learn(STEPS - model.num_timesteps, callback, reset_num_timesteps=False).save(folder / algorithm / "resumed")
 
 
+@pytest.mark.slow
 def test_resuming_in_a_new_process_is_bit_identical(tmp_path):
     models = {}
     for algorithm, (env, policy, settings) in WORLDS.items():

@@ -65,7 +65,9 @@ def play(env, actions):
     return seen
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "processes" else ()) for name in WORLDS]
+)
 def test_original_and_restored_environment_behave_the_same(name):
     first, second = WORLDS[name](0), WORLDS[name](7)
     rng = np.random.default_rng(0)

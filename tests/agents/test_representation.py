@@ -58,7 +58,8 @@ def angles(model):
     return coordinates(blocks.group, blocks.elements)[:, 0, 0].numpy(), places
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_ring_is_found(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)

@@ -226,6 +226,7 @@ def test_the_trunk_does_not_grow_in_the_first_updates():
     assert trunk(frames).max().item() < 5 * before
 
 
+@pytest.mark.slow
 def test_frames_stay_different_in_the_first_updates():
     """Without centring, the TD loss makes the features of all frames of Pong alike within 60 updates."""
     spreads = {}

@@ -507,6 +507,7 @@ def test_the_help_lists_every_command(sb3_eqr):
     assert "--agets a. Did you mean '--agents'?" in sb3_eqr("benchmark run x --agets a", code=2).err
 
 
+@pytest.mark.slow
 def test_plots_with_a_stock_agent(sb3_eqr, tmp_path, monkeypatch):
     import matplotlib.pyplot
 
