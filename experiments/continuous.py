@@ -36,7 +36,6 @@ from torch import nn
 from experiments import markdown
 from experiments.tables import PARTS, area, difference, draw, mean_and_error
 from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
-from sb3_eqr.benchmark.statistics import estimate, iqm
 from sb3_eqr.common.actor_critic import EqRActorCritic
 from sb3_eqr.common.augmentations import random_shift
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
@@ -167,6 +166,8 @@ def train(
     for seed, task, arm in ((seed, task, arm) for seed in seeds for task in tasks for arm in arms):
         file = folder / f"{arm}-{task}-{seed}.json"
         if file.exists():
+            if (found := json.loads(file.read_text())["steps"]) != steps:
+                raise ValueError(f"{file} must have {steps} steps, got {found}. Use a folder for each number of steps.")
             continue
         model: Any = make_agent(arm, task, seed, is_short)
         callbacks: list[BaseCallback] = [Episodes()]
@@ -242,9 +243,9 @@ def report(
 ) -> str:
     """
     Areas by task and arm, the difference from the baseline's with Welch's interval; ratios to the baseline's, geometric mean
-    over tasks, bootstrap interval over seeds; and the IQM of all areas, each divided by the baseline's mean. The areas of all
-    but the baseline end after 1 / ``cost`` of the steps, and all at ``until``. With ``is_greedy``, areas are replaced by the
-    mean return after training, without exploration noise.
+    over tasks with positive areas, bootstrap interval over seeds, which is too narrow for few. The areas of all but the
+    baseline end after 1 / ``cost`` of the steps, and all at ``until``. With ``is_greedy``, areas are replaced by the mean
+    return after training, without exploration noise.
     """
     seconds = {key: float(min(run["seconds"] for run in of_key.values())) for key, of_key in runs.items()}
     areas: dict[tuple[str, str], np.ndarray] = {}
@@ -258,7 +259,7 @@ def report(
     tasks = [task for task in TASKS if (task, baseline) in areas]
     table, rng = [], np.random.default_rng(0)
     for arm in dict.fromkeys(arm for _, arm in areas):
-        cells, ratios, normalised = [], [], []
+        cells, ratios = [], []
         for task in tasks:
             values, of_baseline = areas.get((task, arm)), areas[task, baseline]
             if values is None:
@@ -269,22 +270,18 @@ def report(
             pair = values, of_baseline
             if min(values.mean(), of_baseline.mean()) <= 0:
                 continue  # a ratio would say nothing
-            normalised.append(values / of_baseline.mean())
             draws = [sample[rng.integers(len(sample), size=(10_000, len(sample)))].mean(axis=1) for sample in pair]
             ratios.append(np.append(draws[0] / draws[1], values.mean() / of_baseline.mean()))
-        shown, middle = "", ""
+        shown = ""
         if ratios:
             mean = np.exp(np.mean(np.log(np.maximum(ratios, 1e-3)), axis=0))
             low, high = np.percentile(mean[:-1], [2.5, 97.5])
             has_interval = min(len(areas[task, arm]) for task in tasks if (task, arm) in areas) > 1
             interval = f" [{low:.2f}, {high:.2f}]" if has_interval else ""
             shown = f"{mean[-1]:.2f}{interval}, {len(ratios)} tasks"
-            n_seeds = min(map(len, normalised))
-            value, *ends = estimate(iqm, np.stack([of_task[:n_seeds] for of_task in normalised], axis=1), 2_000)
-            middle = f"{value:.2f}" + (f" [{ends[0]:.2f}, {ends[1]:.2f}]" if n_seeds > 1 else "")
         if any(cells):
-            table.append([arm, *cells, shown, middle])
-    return markdown(["arm", *tasks, f"ratio to {baseline}, geometric mean", "IQM"], table)
+            table.append([arm, *cells, shown])
+    return markdown(["arm", *tasks, f"ratio to {baseline}, geometric mean"], table)
 
 
 def rows(runs: dict[tuple[str, str], dict[int, dict[str, Any]]], arms: Sequence[str]) -> list[dict[str, Any]]:

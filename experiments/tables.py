@@ -225,8 +225,10 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
     for agent in unique(rows, "agent"):
         own, other, cells = by_agent[agent], by_agent.get(baseline, frame[:0]), []
         for game, name in columns:
-            values, others = (part.loc[part["game"] == game, name].dropna().to_numpy() for part in (own, other))
+            every, of_other = (part.loc[part["game"] == game, name] for part in (own, other))
+            values, others = every.dropna().to_numpy(), of_other.dropna().to_numpy()
             shown = ", ".join(map(text, values)) if each else mean_and_error(values)
+            shown += f" ({len(values)} of {len(every)} runs)" if 0 < len(values) < len(every) else ""
             cells.append(shown + (difference(values, others) if not is_ratio and agent != baseline else ""))
         for name in ratios:
             both = [part.pivot(index="seed", columns="game", values=name).reindex(columns=games) for part in (own, other)]
@@ -321,6 +323,8 @@ def compare(
     for agent in agents:
         found = {(r["seed"], r["game"]): r for rows in runs for r in rows if r["agent"] == agent and r["game"] in games}
         scores = pd.Series({run: measure(row, name) for run, row in found.items()}).unstack()[games]
+        if scores.isna().any(axis=None):
+            raise ValueError(f"{agent} must have {name!r} in every run of {', '.join(games)}, got {scores.to_dict()}.")
         if len(games) > 1:
             bounds = read(folder / files[0])[0].normalisation.scores
             scores = scores.apply(lambda column, bounds=bounds: normalised(column, bounds[column.name]))
@@ -452,6 +456,9 @@ def main() -> None:
     rows = [row for file in args.files for row in read(file)[1]]
     full = {name: agent for agent in unique(rows, "agent") for name in (agent, agent.partition(":")[2])}
     wanted = [full.get(name, name) for name in args.agents or full]
+    baseline = full.get(args.baseline, args.baseline)
+    if unknown := {*wanted, baseline} - {*full.values(), None}:
+        parser.error(f"no run of {', '.join(sorted(unknown))}; agents are {', '.join(sorted({*full.values()}))}")
     for key, chosen in (("agent", wanted), ("game", args.games), ("seed", args.seeds)):
         rows = [row for row in rows if chosen is None or row[key] in chosen]
     if not rows:
@@ -463,7 +470,7 @@ def main() -> None:
     elif args.figure:
         draw(rows, args.figure[0], pathlib.Path(args.figure[1]), args.labels, args.axis_label)
     else:
-        print(table(rows, args.measures, full.get(args.baseline, args.baseline), args.ratio, args.each))
+        print(table(rows, args.measures, baseline, args.ratio, args.each))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 from sb3_eqr.benchmark import statistics
-from sb3_eqr.benchmark.comparison import Comparison
+from sb3_eqr.benchmark.comparison import Comparison, counted
 from sb3_eqr.benchmark.reference import SHOWN, load_reference, published_means
 from sb3_eqr.benchmark.scores import normalised
 from sb3_eqr.benchmark.statistics import MIN_RUNS
-from sb3_eqr.benchmark.tables import number
+from sb3_eqr.benchmark.tables import differences_per_game, number
 
 FEW_RUNS = 5  # with fewer, the intervals of the percentile bootstrap are far too narrow
 
@@ -30,7 +30,7 @@ class Analysis:
     # Columns agent, metric, value, low, high, runs, games, from ("runs" or "game means only"), protocol_differs: the metrics
     # that mean something, and the number of games above 1.
     aggregates: pd.DataFrame
-    differences: pd.DataFrame  # of the IQMs from the first agent and from the best, see iqm_differences
+    differences: pd.DataFrame  # of the IQMs from the first agent and from the best, see iqm_differences; empty without IQM
     reps: int  # bootstrap samples behind all intervals
 
 
@@ -52,6 +52,8 @@ def analyse(comparison: Comparison, reps: int) -> Analysis:
     aggregates["protocol_differs"] = aggregates["agent"].map(comparison.differing).fillna("")
     columns = ["agent", "metric", "value", "low", "high", "runs", "games", "from", "protocol_differs"]
     baseline = comparison.agents[0]
+    if not comparison.is_averaged:
+        return Analysis(comparison, matrices, means, aggregates[columns], pd.DataFrame(), reps)
     best = max(comparison.agents, key=lambda agent: float(statistics.iqm(matrices[agent])))
     differences = statistics.iqm_differences(matrices, baseline, reps)
     if best != baseline:
@@ -72,6 +74,8 @@ def _aggregates(comparison: Comparison, matrices: Mapping[str, np.ndarray], reps
 def conclusion(analysis: Analysis) -> list[str]:
     """:return: sentences on what the runs show, the most important first"""
     comparison = analysis.comparison
+    if not comparison.is_averaged:
+        return per_game_in_words(comparison)
     sentences = [difference_in_words(row, comparison) for row in analysis.differences.to_dict("records")]
     alike = {agent: matrix for agent, matrix in analysis.matrices.items() if agent not in comparison.differing}
     best = statistics.distinct_best(alike, analysis.reps)
@@ -83,6 +87,22 @@ def conclusion(analysis: Analysis) -> list[str]:
     if any(abs(row["difference"]) < row["detectable"] for row in analysis.differences.to_dict("records")):
         sentences.append("Four times as many seeds would detect differences half as large.")
     return sentences
+
+
+def per_game_in_words(comparison: Comparison) -> list[str]:
+    """:return: a sentence per agent on the games on which it differs from the first, for scores without a common scale"""
+    found = differences_per_game(comparison)
+    first, sentences = comparison.label(comparison.agents[0]), []
+    for agent in dict.fromkeys(agent for agent, _ in found):
+        of_agent = {game: ends for (name, game), (_, *ends) in found.items() if name == agent}
+        better = [game for game, (low, _) in of_agent.items() if low > 0]
+        worse = [game for game, (_, high) in of_agent.items() if high < 0]
+        rest = counted(len(of_agent) - len(better) - len(worse), "game")
+        sentences.append(
+            f"Compared with {first}, {comparison.label(agent)} is better on {', '.join(better) or 'no game'}, worse on "
+            f"{', '.join(worse) or 'no game'}, with no clear difference on {rest} (95% intervals of Welch's t test)."
+        )
+    return [*sentences, "Scores are raw and each game has its own scale, so they are not averaged over games."]
 
 
 def difference_in_words(row: dict[str, Any], comparison: Comparison) -> str:
@@ -118,11 +138,6 @@ def _distinct(difference: float, detectable: float) -> tuple[str, str]:
     return texts
 
 
-def counted(count: int, noun: str) -> str:
-    """:return: "1 game", "5 games" """
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def notes(analysis: Analysis) -> list[str]:
     """:return: caveats that readers need before the numbers"""
     comparison = analysis.comparison
@@ -145,9 +160,12 @@ def table_notes(analysis: Analysis) -> list[str]:
     found = [
         "Raw scores: mean ± standard deviation over runs. "
         "Bold: significantly better than every other agent with the same protocol.",
-        f"The last rows are aggregates of {'raw' if comparison.is_raw else 'normalised'} scores over all runs and games, with "
-        f"95% intervals{'' if comparison.is_raw else f'; {comparison.above_one} are games with a mean above 1'}.",
     ]
+    if comparison.is_averaged:
+        found.append(
+            f"The last rows are aggregates of {'raw' if comparison.is_raw else 'normalised'} scores over all runs and games, "
+            f"with 95% intervals{'' if comparison.is_raw else f'; {comparison.above_one} are games with a mean above 1'}."
+        )
     if len(analysis.means.columns):
         sources = load_reference().drop_duplicates("method").set_index("method")["source"]
         found += [f"† {m.label}: 100K steps, game means only ({m.n_runs}), no interval. {sources[m.method]}." for m in SHOWN]

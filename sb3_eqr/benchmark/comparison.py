@@ -43,8 +43,15 @@ class Comparison:
         return self.unit == RAW
 
     @property
+    def is_averaged(self) -> bool:
+        """Whether scores of different games are averaged: raw ones have no common scale."""
+        return not self.is_raw or len(self.games) == 1
+
+    @property
     def metrics(self) -> list[str]:
         """The aggregates that mean something."""
+        if not self.is_averaged:
+            return []
         return [metric for metric in METRICS if metric != "optimality gap"] if self.is_raw else [*METRICS, self.above_one]
 
     @property
@@ -69,6 +76,11 @@ class Comparison:
         """:return: mean wall-clock time of a run; NaN for a reference"""
         times = [result["wall_clock_s"] for result in self.runs(agent)]
         return float(np.mean(times)) / 60 if times else np.nan
+
+
+def counted(count: int, noun: str) -> str:
+    """:return: "1 game", "5 games" """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def compare(
@@ -102,10 +114,11 @@ def compare(
     agents = sorted(chosen, key=lambda agent: (agent != baseline, agent.startswith("eqr_"), agent in with_eqr, agent))
     used = [row for row in results if row["game"] in games and row["seed"] in chosen[row["agent"]]]
     used.sort(key=lambda row: (agents.index(row["agent"]), games.index(row["game"]), row["seed"]))
-    if stopped := sum(len(rows) - len(finished[folder]) for folder, (_, rows) in found.items()):
-        notes.append(f"{stopped} runs were stopped before their end and are left out.")
-    left = [run for folder, (_, rows) in found.items() for run in _unfinished(folder, rows)]
-    if unfinished := [run.label for run in left if not wanted or run.agent.name in wanted]:
+    stopped = [row for _, of_folder in found.values() for row in of_folder if "stopped_at" in row]
+    if left := sum(not wanted or row["agent"] in wanted for row in stopped):
+        notes.append(f"{counted(left, 'run')} stopped before the end: left out.")
+    planned = [run for folder, (_, rows) in found.items() for run in _unfinished(folder, rows)]
+    if unfinished := [run.label for run in planned if not wanted or run.agent.name in wanted]:
         notes.append(f"Left out, because they have not finished: {'; '.join(unfinished)}.")
     notes += [*selection.never_learn(used), *selection.settings_differences(used)]
     differing = selection.protocol_differences(used)
@@ -149,7 +162,9 @@ def _select(finished: Mapping[pathlib.Path, list[dict[str, Any]]], agents: list[
     """
     for folder, rows in finished.items():
         if not rows:
-            raise ValueError(f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run first.")
+            raise ValueError(
+                f"{folder} must contain finished runs, got none. Run sb3-eqr benchmark run, again if runs were stopped."
+            )
     there = {row["agent"] for rows in finished.values() for row in rows}
     for agent in agents:
         if agent not in there:

@@ -57,12 +57,9 @@ def all_figures(analysis: Analysis) -> list[ReportFigure]:
     """:return: the figures for which there is data"""
     style = looks([analysis.comparison.label(agent) for agent in analysis.matrices])
     with styled():
-        return [
-            _profiles(analysis, style),
-            _aggregates(analysis, style),
-            *_sample_efficiency(analysis, style),
-            *_learning_curves(analysis.comparison, style),
-        ]
+        found = [_profiles(analysis, style), _aggregates(analysis, style)] if analysis.comparison.is_averaged else []
+        found += _sample_efficiency(analysis, style) if found else []
+        return found + _learning_curves(analysis.comparison, style)
 
 
 def _bands(analysis: Analysis, beginning: str) -> str:

@@ -11,8 +11,8 @@ import jinja2
 import numpy as np
 import pandas as pd
 
-from sb3_eqr.benchmark.analysis import all_of, analyse, conclusion, counted, notes, table_notes
-from sb3_eqr.benchmark.comparison import Comparison, compare
+from sb3_eqr.benchmark.analysis import all_of, analyse, conclusion, notes, table_notes
+from sb3_eqr.benchmark.comparison import Comparison, compare, counted
 from sb3_eqr.benchmark.figures import all_figures, to_png, width_on_page
 from sb3_eqr.benchmark.selection import flatten
 from sb3_eqr.benchmark.statistics import REPS
@@ -91,8 +91,8 @@ def _lead(comparison: Comparison) -> str:
     return (
         f"{counted(len(comparison.agents), 'agent')} on {counted(len(comparison.games), 'game')}, "
         f"{per_game} of each per game, started {when}. "
-        f"{'Scores are raw' if comparison.is_raw else f'Normalised scores: {comparison.unit} ({comparison.source})'}. "
-        "IQM: the mean of their middle half."
+        f"{'Scores are raw' if comparison.is_raw else f'Normalised scores: {comparison.unit} ({comparison.source})'}."
+        f"{' IQM: the mean of their middle half.' if comparison.is_averaged else ''}"
     )
 
 

@@ -1,6 +1,7 @@
 """Tables of a report: strings in a pandas frame, whose first column names the rows, and a mask of those in bold."""
 
 import html
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -109,22 +110,29 @@ def game_table(
     return make_table(header, rows, [[agent == name for agent in columns] for name in [*best, None]])
 
 
-def difference_table(comparison: Comparison) -> Table:
+def differences_per_game(comparison: Comparison) -> dict[tuple[str, str], tuple[float, float, float]]:
     """
-    A row per game, a column per agent: the difference of its mean raw score from that of the first agent, and its 95%
-    interval (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28), where both have several runs with different scores.
+    (agent, game) -> the difference of its mean raw score from that of the first agent, and the ends of its 95% interval
+    (Welch 1947, https://doi.org/10.1093/biomet/34.1-2.28): NaN unless both have several runs with different scores.
     """
     raw = {key: rows["raw"].to_numpy() for key, rows in comparison.scores.groupby(["agent", "game"])}
     first, *others = dict.fromkeys(comparison.scores["agent"])
-    rows = []
-    for game in comparison.games:
-        cells = []
-        for agent in others:
-            pair = raw[agent, game], raw[first, game]
-            text = number(pair[0].mean() - pair[1].mean())
-            if min(map(len, pair)) > 1 and max(map(np.ptp, pair)) > 0:
-                ends = ttest_ind(*pair, equal_var=False).confidence_interval()
-                text += f"\n[{number(ends.low)}, {number(ends.high)}]"
-            cells.append(text)
-        rows.append([game, *cells])
+    found = {}
+    for agent, game in itertools.product(others, comparison.games):
+        pair, ends = (raw[agent, game], raw[first, game]), (np.nan, np.nan)
+        if min(map(len, pair)) > 1 and max(map(np.ptp, pair)) > 0:
+            ends = tuple(ttest_ind(*pair, equal_var=False).confidence_interval())
+        found[agent, game] = pair[0].mean() - pair[1].mean(), *ends
+    return found
+
+
+def difference_table(comparison: Comparison) -> Table:
+    """A row per game, a column per agent: see :func:`differences_per_game`."""
+    first, *others = dict.fromkeys(comparison.scores["agent"])
+    found = differences_per_game(comparison)
+
+    def cell(difference: float, low: float, high: float) -> str:
+        return number(difference) + ("" if np.isnan(low) else f"\n[{number(low)}, {number(high)}]")
+
+    rows = [[game, *(cell(*found[agent, game]) for agent in others)] for game in comparison.games]
     return make_table([f"minus {comparison.label(first)}", *map(comparison.label, others)], rows)

@@ -237,8 +237,7 @@ def load_checkpoint(checkpoint: pathlib.Path, model: BaseAlgorithm) -> tuple[Bas
         if hasattr(buffer, "timeouts") and buffer.size() > 0:  # no n-step return across the gap
             last = buffer.pos - 1
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])  # a terminal state stays one
-    is_exact &= not getattr(model, "use_sde", False)  # the noise of the next rollout was drawn before the checkpoint
-    return model, decode(manifest["notes"]), is_exact
+    return model, decode(manifest["notes"]), is_exact and not checkpoints.drawn_anew(model)
 
 
 def clean_up(folder: pathlib.Path) -> None:

@@ -215,8 +215,12 @@ class EqRAlgorithm(EqROffPolicy):
         validation.check_same_parameters(self.policy_description, saved)
         self._convert_train_freq()
         self._create_aliases()
-        start, end = self.exploration_initial_eps, self.exploration_final_eps
-        self.exploration_schedule = LinearSchedule(start, end, self.exploration_fraction)
+        self._make_exploration_schedule()
+        if self.target_update_interval and self.n_envs > self.target_update_interval:
+            warnings.warn(
+                f"target_update_interval={self.target_update_interval} is smaller than the number of environments, "
+                f"{self.n_envs}, so the target is updated at every call of env.step. Pass at least {self.n_envs}."
+            )
         if self.representation_frozen:
             self.policy.freeze(list(representation(self.policy).values()))
         self._trained = [p for group in self.policy.optimizer.param_groups for p in group["params"]]
@@ -225,6 +229,10 @@ class EqRAlgorithm(EqROffPolicy):
         self._monitor = UpdateMonitor(self.policy)
         self._set_up_objective()
         keep_freed_memory()
+
+    def _make_exploration_schedule(self) -> None:
+        ends = self.exploration_initial_eps, self.exploration_final_eps
+        self.exploration_schedule = LinearSchedule(*ends, self.exploration_fraction)
 
     def _set_up_objective(self) -> None:
         if self.policy.bfloat16_targets:
@@ -280,6 +288,7 @@ class EqRAlgorithm(EqROffPolicy):
         check_arguments(vars(self), self.rules)  # attributes may have been changed
         self._check_losses()
         self._check_losses_of_policy()
+        self._make_exploration_schedule()
         if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):
             self._set_up_objective()
         result = super()._setup_learn(*args, **kwargs)
@@ -313,7 +322,8 @@ class EqRAlgorithm(EqROffPolicy):
         assert buffer is not None
         self._start_round(buffer)
         for i in range(gradient_steps):
-            if self._resets.is_due(self._n_updates, gradient_steps - i + self._updates_left()):
+            is_reset = self._resets.is_due(self._n_updates, gradient_steps - i + self._updates_left())
+            if is_reset:
                 self._reset()
             buffer.n_steps, buffer.gamma = self._resets.annealed(self._n_updates, self.n_steps, self.gamma)
             buffer.prediction_depth = self.depth
@@ -321,6 +331,8 @@ class EqRAlgorithm(EqROffPolicy):
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
             priorities, metrics = update(samples)
+            if is_reset and self.target_update_interval is not None:  # until now, its statistics were of the old features
+                self.policy.update_target(1.0)
             self._n_updates += 1
             if priorities is not None:
                 buffer.update_priorities(samples.indices, priorities)

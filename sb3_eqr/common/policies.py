@@ -57,7 +57,7 @@ class EqRPolicy(BasePolicy):
     :param activation_fn: Activation function of the Q head
     :param features_extractor_class: the trunk, which the group encoder is put on top of. A class or a name: "nature" (the
         paper's three convolutions), "impala" (the residual network of IMPALA, with ``width_scale``), "mlp" (one layer of 256),
-        "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), ``DictExtractor`` (MultiInputPolicy)
+        "two_layer", "flatten" (SB3's). ``None``: "mlp" (MlpPolicy), "nature" (CnnPolicy), ``DictExtractor`` (MultiInputPolicy)
     :param features_extractor_kwargs: keyword arguments of the trunk: those of
         :class:`~sb3_eqr.common.networks.encoders.ConvExtractor` for "nature", those of
         :class:`~sb3_eqr.common.networks.encoders.ImpalaExtractor` for "impala", those of
@@ -352,6 +352,11 @@ def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
         raise ValueError(
             'features_extractor_class must be an image trunk without a linear layer if transition="convolutional", '
             f'got {type(trunk).__name__}. Pass features_extractor_class="nature" or "impala" without features_dim.'
+        )
+    if not trunk.rescale:
+        raise ValueError(
+            'features_extractor_kwargs must have rescale=True if transition="convolutional", which predicts values in [0, 1], '
+            "got rescale=False."
         )
     return trunk.map_shape
 

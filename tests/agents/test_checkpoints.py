@@ -160,7 +160,8 @@ def test_a_folder_of_the_user_with_the_name_of_a_checkpoint_is_kept(tmp_path):
     mine = tmp_path / "checkpoint-000000000020" / "notes.txt"
     mine.parent.mkdir()
     mine.write_text("mine")
-    EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(40, ExactCheckpointCallback(20, tmp_path))
+    with pytest.raises(ValueError, match=r"checkpoint-000000000020 must be a checkpoint, got one without manifest\.json"):
+        EqRQRDQN("MlpPolicy", ChainEnv(), **SMALL).learn(40, ExactCheckpointCallback(20, tmp_path))
     assert mine.read_text() == "mine"
 
 

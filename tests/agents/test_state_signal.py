@@ -149,7 +149,7 @@ def test_a_new_predictor_changes_nothing():
     policy, rows = EqRRainbow("MlpPolicy", ChainEnv(), seed=0).policy, th.randn(5, 72)
     th.testing.assert_close(policy.latent_model.project(rows), policy.latent_target.projection(rows))
     spr = {"group": None, "transition": "convolutional", "projection": "none", "predictor": True, "layer_norm": False}
-    spr |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]]}}
+    spr |= {"features_extractor_kwargs": {"layers": [[4, 8, 4], [8, 3, 1]], "rescale": True}}
     policy = EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, seed=0, policy_kwargs=spr).policy
     assert policy.latent_model.predictor.weight.diagonal().abs().max() < 0.5
 
@@ -174,12 +174,14 @@ def test_spr_trains_saves_and_loads(tmp_path):
 
 def test_a_convolutional_transition_needs_a_feature_map():
     spr = {"transition": "convolutional", "group": None, "layer_norm": False}
+    with pytest.raises(ValueError, match=r"must have rescale=True if transition"):
+        EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, policy_kwargs=spr)
     with pytest.raises(ValueError, match=r"group must be None if transition"):
         EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={"transition": "convolutional"})
     with pytest.raises(ValueError, match=r"must be an image trunk.*got MlpExtractor"):
         EqRRainbow("MlpPolicy", ChainEnv(), symmetry_coef=0.0, policy_kwargs=spr)
     with pytest.raises(ValueError, match=r"group must have inverses for the GET loss, got None. Pass symmetry_coef=0\.$"):
-        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs=spr)
+        EqRRainbow("CnnPolicy", ImageEnv(), policy_kwargs={**spr, "features_extractor_kwargs": {"rescale": True}})
     with pytest.raises(ValueError, match=r"layer_norm must be False if transition"):
         EqRRainbow("CnnPolicy", ImageEnv(), symmetry_coef=0.0, policy_kwargs={**spr, "layer_norm": True})
     with pytest.raises(ValueError, match=r"transition must be one of"):

@@ -459,7 +459,7 @@ def test_our_environments_are_a_suite(files):
     """With the arguments of each, in training and evaluation."""
     suite = choose(load_suite("worlds"), None, 100)
     runs = {run.game: run for run in plan_runs(files / "b", suite, ["eqr_rainbow"], [0])}
-    assert {runs[game].protocol["env_id"] for game in runs} >= {"SlidingBallTorus-v0", "StarField-v0", "BlindCliffwalk-v0"}
+    assert {runs[game].protocol["env_id"] for game in runs} >= {"SlidingBallTorus-v0", "PixelPendulum-v0", "BlindCliffwalk-v0"}
     assert runs["torus_of_8"].entry["env_kwargs"]["n_distractors"] == 8
     env = make_game(runs["torus_of_4"].protocol)
     assert env.unwrapped.n_distractors == 4 and env.unwrapped.n_steps == 16

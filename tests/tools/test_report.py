@@ -293,7 +293,7 @@ def test_nothing_to_compare(tmp_path):
 
     with pytest.raises(ValueError, match="dqn must have a seed finished on every game, got none: Pong: 0; Boxing: 1, 2"):
         compare([a_benchmark(tmp_path / "b", {"dqn": SCORES["dqn"]}, change=change)], {}, False)
-    with pytest.raises(ValueError, match=r"c must contain finished runs, got none. Run sb3-eqr benchmark run first"):
+    with pytest.raises(ValueError, match=r"c must contain finished runs, got none. Run sb3-eqr benchmark run, again if"):
         compare([a_benchmark(tmp_path / "c", {})], {}, False)
     with pytest.raises(ValueError, match=r"nowhere must be a folder of sb3-eqr benchmark run, got no folder. Run"):
         compare([tmp_path / "nowhere"], {}, False)
@@ -489,7 +489,18 @@ def test_raw_scores_have_no_gap_and_no_bounds(tmp_path, report_of):
     page = report_of(suite=suite)
     for text in (text_of(page), page.with_name("table.md").read_text(), page.with_name("aggregates.csv").read_text()):
         assert not re.search("optimality gap|score 0|score 1|games above|normalised scores", text), text
-    assert [shown.name for shown in all_figures(analyse(compare([tmp_path / "a"], {}, False), 5))][1] == "aggregates"
+
+
+def test_raw_scores_of_several_games_are_not_averaged(tmp_path, report_of):
+    """A quarter trimmed at each end of all raw scores would be whole games: here that on which the agents differ."""
+    suite = make_suite("own", "test", {key: value for key, value in ENTRY.items() if key != "normalisation"})
+    scores = {game: [1.0, 2.0, 3.0] for game in SUITE.games}
+    page = report_of({"dqn": scores, FULL: {**scores, "Krull": [1001.0, 1002.0, 1003.0]}}, suite)
+    found = text_of(page)
+    assert f"Compared with dqn, {FULL} is better on Krull, worse on no game, with no clear difference on 2 games" in found
+    assert "IQM" not in found and not page.with_name("aggregates.png").exists() and page.with_name("table.md").exists()
+    one = a_benchmark(tmp_path / "one", {"dqn": {"Pong": [1.0, 2.0, 3.0]}, FULL: {"Pong": [7.0, 8.0, 9.0]}}, suite)
+    assert f"{FULL} is better than dqn: its IQM is 6.00 higher" in conclusion(analyse(compare([one], {}, True), 20))[0]
 
 
 def test_the_baseline_is_the_same_agent_without_eqr_where_no_stock_agent_ran(tmp_path):
@@ -525,7 +536,7 @@ def test_a_file_of_packed_runs_is_reported_like_its_folder(tmp_path):
     assert pack(both, file) == 18
     found = compare([file], {}, False)
     assert found.games == SUITE.games and found.agents == ["dqn", FULL] and found.bounds["Pong"] == tuple(PONG)
-    assert found.notes[0] == "6 runs were stopped before their end and are left out."
+    assert found.notes[0] == "6 runs stopped before the end: left out."
     raw = {key: rows["raw"].tolist() for key, rows in found.scores.groupby(["agent", "game"])}
     assert raw["dqn", "Pong"] == [7.0, 8.0] and raw["dqn", "Krull"] == [1598.0, 1798.0]
     assert found.results[0]["command"] == "run here --agents dqn:a.yml dqn:settings/b.yml dqn:c.yml:two"

@@ -491,3 +491,13 @@ def test_frames_that_a_gpu_has_no_room_for_stay_in_the_computer(monkeypatch):
     with pytest.warns(UserWarning, match=r"need 0.00 GB, and cuda has 0.00 GB left, also for updates, so they stay"):
         store = FrameStore(40, 1, (4, 84, 84), np.dtype(np.uint8), 4, "cuda")
     assert isinstance(store._frames, np.ndarray)
+
+
+@pytest.mark.parametrize("kind", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
+def test_a_buffer_without_a_whole_window_says_so(kind):
+    buffer = kind(20, spaces.Box(-1, 1, (2,)), spaces.Discrete(2), n_steps=1, prediction_depth=3)
+    for steps in (0, 3):
+        with pytest.raises(ValueError, match=f"must hold 4 steps, a whole window, got {steps}"):
+            buffer.sample(2)
+        for _ in range(3):
+            buffer.add(np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1), np.zeros(1), np.zeros(1), [{}])

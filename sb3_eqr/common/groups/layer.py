@@ -97,11 +97,11 @@ class Whitening(nn.Module):
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
-        :param features: (B, D); B ≥ 2 in train mode
+        :param features: (B, D); B ≥ 2 in train mode, where statistics are those of the batch if a gradient is recorded
         :return: (B, D)
         """
         mean, covariance = self.running_mean, self.running_covariance
-        if self.training:
+        if self.training and th.is_grad_enabled():
             n, n_features = features.shape
             mean = features.mean(dim=0)
             centred = features - mean

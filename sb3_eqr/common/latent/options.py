@@ -22,9 +22,10 @@ class LatentOptions:
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
         (:class:`~sb3_eqr.common.latent.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
         and ``layer_norm=False``, since it predicts values in [0, 1]
-    :param latent_hidden_dim: width ≥ 1 of the hidden layers of κ, r_ψ and ρ, and of ``projection="own"``; 256 in appendix B.4
-    :param latent_norm: norm of these layers: "layer", or "batch" (appendix B.4), with which an unusual state in a batch
-        changes the predictions for all others (docs/gradients.md)
+    :param latent_hidden_dim: width ≥ 1 of the hidden layers of κ, r_ψ and ρ, of b, and of ``projection="own"``; 256 in
+        appendix B.4
+    :param latent_norm: norm of the hidden layers of κ(x, a), r_ψ and ρ: "layer", or "batch" (appendix B.4), with which an
+        unusual state in a batch changes the predictions for all others (docs/gradients.md)
     :param projection: p of the AET loss: "head", the first layer of the Q head (appendix B.4), "own", a separate layer, or
         "none", the state itself (§5)
     :param predictor: whether to add a linear layer after p on the online side only, as in SPR

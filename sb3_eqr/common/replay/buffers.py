@@ -188,8 +188,13 @@ class SequenceReplayBuffer(ReplayBuffer):
         if self.prediction_depth == 0:  # the same draws as SB3
             positions = np.random.randint(0, self.size(), size=batch_size)
         else:
+            self._check_filled()
             positions = self._positions(np.random.randint(0, self.n_starts, size=batch_size))
         return self._windows(positions, np.random.randint(0, self.n_envs, size=batch_size), env)
+
+    def _check_filled(self) -> None:
+        if self.n_starts < 1:
+            raise ValueError(f"The buffer must hold {self.window} steps, a whole window, got {self.size()}. Add more first.")
 
     def update_priorities(self, indices: np.ndarray, priorities: th.Tensor) -> None:
         """Do nothing: uniform replay has no priorities; see :class:`PrioritizedSequenceReplayBuffer`."""
@@ -377,6 +382,7 @@ class PrioritizedSequenceReplayBuffer(SequenceReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:  # type: ignore[override]
         """As :class:`SequenceReplayBuffer`, but stratified by priority; pass ``indices`` to :meth:`update_priorities`."""
+        self._check_filled()
         self._follow_window()
         leaves = self._tree.sample(batch_size, np.random.random_sample(batch_size))
         priorities = self._tree.get(leaves)

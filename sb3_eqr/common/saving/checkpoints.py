@@ -45,11 +45,13 @@ def write_checkpoint(
     assert env is not None
     checkpoint = folder / f"{PREFIX}{model.num_timesteps:012d}"
     remove_leftovers(folder, f"{PREFIX}*")  # also of other steps, which may never be written again
-    if (checkpoint / MANIFEST).is_file():  # anything else of this name is the user's
+    if (checkpoint / MANIFEST).is_file():
         try:
             read_manifest(checkpoint)
         except ValueError:
             discard(checkpoint)
+    elif checkpoint.exists():
+        raise ValueError(f"{checkpoint} must be a checkpoint, got one without {MANIFEST}. Move it to another place.")
     with _last_named(folder), atomic_folder(checkpoint) as partial:
         model.save(partial / MODEL)
         if with_buffer and isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -165,13 +167,17 @@ def warn_of_unknown(classes: list[str]) -> None:
     )
 
 
-def warn_of_noise(model: BaseAlgorithm) -> None:
-    """Warn, at the start of a run, that the noise of its actions is drawn anew when it is resumed."""
+def drawn_anew(model: BaseAlgorithm) -> list[str]:
+    """The noise of an agent's actions that SB3 draws anew when training resumes."""
     noise = getattr(model, "action_noise", None)
     kept = NormalActionNoise, type(None)  # has no state
     names = ["use_sde=True"] if model.use_sde else []
-    names += [type(noise).__name__] if not isinstance(getattr(noise, "base_noise", noise), kept) else []
-    if names:
+    return names + ([type(noise).__name__] if not isinstance(getattr(noise, "base_noise", noise), kept) else [])
+
+
+def warn_of_noise(model: BaseAlgorithm) -> None:
+    """Warn, at the start of a run, that the noise of its actions is drawn anew when it is resumed."""
+    if names := drawn_anew(model):
         warnings.warn(
             f"{' and '.join(names)}: SB3 draws this noise anew when training resumes, so it does not continue bit for bit. "
             "Use NormalActionNoise, or none."
