@@ -66,7 +66,7 @@ def test_arguments_out_of_range(make, kwargs, message):
 
 
 DICT, IMAGES, VECTORS = {"policy": "MultiInputPolicy"}, {"policy": "CnnPolicy"}, ("mlp", "flatten")
-NO_DICTS, OUTSIDE = "must accept dicts, got .*Use MultiInputPolicy", r"Use VecNormalize\(VecTransposeImage\(env\)\)"
+NO_DICTS, OUTSIDE = "must accept dicts, got .*Use MultiInputPolicy", r"Use VecNormalize\(VecTransposeImage\(env\), norm_obs=False\)"
 
 
 @pytest.mark.parametrize(

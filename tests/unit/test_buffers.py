@@ -495,7 +495,7 @@ def test_frames_that_a_gpu_has_no_room_for_stay_in_the_computer(monkeypatch):
 
 @pytest.mark.parametrize("kind", [SequenceReplayBuffer, PrioritizedSequenceReplayBuffer])
 def test_a_buffer_without_a_whole_window_says_so(kind):
-    buffer = kind(20, spaces.Box(-1, 1, (2,)), spaces.Discrete(2), n_steps=1, prediction_depth=3)
+    buffer = kind(20, spaces.Box(-1, 1, (2,)), spaces.Discrete(2), n_steps=1, prediction_depth=4)
     for steps in (0, 3):
         with pytest.raises(ValueError, match=f"must hold 4 steps, a whole window, got {steps}"):
             buffer.sample(2)
