@@ -114,8 +114,6 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     if args.resume is not None:
         with failing("--resume: "):
             of_run = config_of(args.resume, args.trust, args.gym_packages)
-        if of_run is not None and args.conf_file is not None:
-            fail("--resume uses the settings of the run: leave out --conf-file.")
         path = path if of_run is None else write_entry(args, of_run)
     # as in RL Zoo, --env-kwargs replace those of the entry
     changes = {**args.hyperparams, **({"env_kwargs": args.env_kwargs} if args.env_kwargs else {})}
