@@ -95,7 +95,8 @@ def draw_curves(axes: Any, curves: dict[str, tuple[list[int], list[float]]], ste
             band = scores.min(axis=0), scores.max(axis=0)
             axes.fill_between(runs[0]["step"], *band, color=look.color, alpha=0.15, linewidth=0)
     axes.set(xlabel="training steps", ylabel="return in training", xlim=(0, steps), xticks=range(0, steps + 1, 4_000))
-    axes.xaxis.set_major_formatter("{x:,.0f}")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:,.0f}")
     axes.margins(y=0.08)
     axes.legend(loc="upper left")
     axes.grid()
