@@ -66,7 +66,8 @@ def test_arguments_out_of_range(make, kwargs, message):
 
 
 DICT, IMAGES, VECTORS = {"policy": "MultiInputPolicy"}, {"policy": "CnnPolicy"}, ("mlp", "flatten")
-NO_DICTS, OUTSIDE = "must accept dicts, got .*Use MultiInputPolicy", r"Use VecNormalize\(VecTransposeImage\(env\), norm_obs=False\)"
+NO_DICTS = "must accept dicts, got .*Use MultiInputPolicy"
+OUTSIDE = r"Use VecNormalize\(VecTransposeImage\(env\), norm_obs=False\)"
 
 
 @pytest.mark.parametrize(
