@@ -46,14 +46,14 @@ copybutton_exclude = ".linenos, .gp, .go"  # comments in commands are copied, pr
 def unlink_outside(app, docname, source):
     """
     Links to files outside docs/ become downloads by themselves. A link to a folder or a page there works on GitHub only: here
-    its text stays.
+    its text and path stay.
     """
     folder = (DOCS / docname).parent
 
     def text_of(match: re.Match) -> str:
         target = (folder / match[2]).resolve()
-        is_outside = not target.is_relative_to(DOCS)
-        return match[1] if is_outside and (target.is_dir() or target.suffix == ".md") else match[0]
+        is_dead = not target.is_relative_to(DOCS) and (target.is_dir() or target.suffix == ".md")
+        return f"{match[1]} (`{target.relative_to(DOCS.parent)}`)" if is_dead else match[0]
 
     source[0] = re.sub(r"\[([^\]]+)\]\((\.\./[^)#]*)\)", text_of, source[0])
 

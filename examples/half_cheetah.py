@@ -97,6 +97,7 @@ def draw_curves(axes: Any, curves: dict[str, tuple[list[int], list[float]]], ste
     axes.set(xlabel="training steps", ylabel="return in training", xlim=(0, steps), xticks=range(0, steps + 1, 4_000))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:,.0f}")
+    axes.set_title(ENV_ID, fontsize="medium")
     axes.margins(y=0.08)
     axes.legend(loc="upper left")
     axes.grid()

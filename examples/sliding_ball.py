@@ -164,6 +164,7 @@ def draw(model: EqRQRDQN, world: SlidingBall, path: pathlib.Path) -> None:
                     place = (1.22 * np.cos(angle), -1.22 * np.sin(angle))
                     panel.annotate(str(number), place, ha="center", va="center", fontsize=8)
                 panel.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5), aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+                panel.set(xlabel="x", ylabel="y")
                 panel.set_title(f"block {k}" if n_blocks > 1 else "latent states, SO(2)")
         with atomic_write(path, "png") as file:
             figure.savefig(file, dpi=200)

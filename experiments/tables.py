@@ -47,7 +47,7 @@ AXES = {
     "return": "mean return in training",
     "goals": "goals reached per tenth of the run",
 }
-TITLES = {"torus_of_4": "4 distractors", "torus_of_8": "8 distractors", "large_torus": "large torus"}
+TITLES = {"torus_of_4": "torus, 4 distractors", "torus_of_8": "torus, 8 distractors", "pendulum": "PixelPendulum-v0"}
 VERDICTS = {  # colour and marker of each
     "better with EqR": (COLORS[0], "^"),
     "no clear difference": (GREY, "o"),
@@ -66,8 +66,8 @@ COMPARED: list[Arguments] = [
         for task in ("HalfCheetah", "Ant", "Walker2d", "Hopper", "Humanoid")
     ),
     ("HalfCheetah, EqRTQC", ["continuous_early.xz"], ["HalfCheetah-v5"], ("eqr_tqc", "tqc"), *EARLY),
-    ("HalfCheetah with noise, EqRSAC", NOISE, ["HalfCheetah-v5+noise"], ("eqr_sac", "sac"), *EARLY),
-    ("Torus, 8 distractors, AET 5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
+    ("HalfCheetah, noise inputs, EqRSAC", NOISE, ["HalfCheetah-v5+noise"], ("eqr_sac", "sac"), *EARLY),
+    ("Torus, 8 distractors, aet_coef=5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Large torus", ["worlds.jsonl.xz"], ["large_torus"], DEFAULTS, "goals", "worlds.md#a-large-torus"),
@@ -77,7 +77,7 @@ COMPARED: list[Arguments] = [
     ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
     ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
     *(
-        (f"{game}, {agent}", MINATAR_RUNS, [game], (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
+        (f"MinAtar {game}, {agent}", MINATAR_RUNS, [game], (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
         for agent, off in OFF.items()
         for game in MINATAR
     ),
@@ -132,7 +132,7 @@ MEASURES: dict[str, Callable[[Row], float]] = {
 def measure(row: Row, name: str) -> float:
     """
     :param name: a key of ``MEASURES``; "20000-40000", the mean return of the training episodes that ended in these steps;
-        "area20000-40000", the same with episodes weighted by their lengths; "at475", the step of the first evaluation of at
+        "area20000-40000", the same with episodes weighted by their lengths; "goals0-4000", the goals in these steps; "at475", the step of the first evaluation of at
         least 475; "until10000", the mean of the evaluations up to this step; or "train/KEY", the last value of a logged key
     :return: its value, NaN if the run does not have it; what was measured when the run was made comes first
     """
@@ -148,7 +148,9 @@ def measure(row: Row, name: str) -> float:
         if name.startswith("until"):
             return float(scores[steps <= limit].mean())
         return float(min(steps[scores >= limit], default=np.nan))
-    first, end = map(int, name.removeprefix("area").split("-"))
+    first, end = map(int, name.removeprefix("area").removeprefix("goals").split("-"))
+    if name.startswith("goals"):
+        return sum(first < step <= end for step in goals(row))
     if name.startswith("area"):
         return area(row, first, end)
     steps, scores = np.array(row["training"]["step"]), np.array(row["training"]["score"])
@@ -365,7 +367,7 @@ def differences(found: list[Compared]) -> str:
         largest = max(map(abs, one.ends))
         digits = 0 if largest >= 20 else 1 if largest >= 1 else 2
         numbers = (*one.means, one.difference, *one.ends)
-        cells = [f"{value + 1e-9:,.{digits}f}".replace("-", "−") for value in numbers]  # 0.285 is 0.29
+        cells = [f"{value:,.{digits}f}".replace("-", "−") for value in numbers]
         shown = [f"[{one.task}]({one.page})", f"{one.steps:,}", str(one.seeds), *cells[:2]]
         lines.append([*shown, f"{cells[2]} [{cells[3]}, {cells[4]}]", one.verdict])
     header = ["task", "steps", "seeds", "with EqR", "without", "difference, 95% CI", "verdict"]
