@@ -132,8 +132,9 @@ MEASURES: dict[str, Callable[[Row], float]] = {
 def measure(row: Row, name: str) -> float:
     """
     :param name: a key of ``MEASURES``; "20000-40000", the mean return of the training episodes that ended in these steps;
-        "area20000-40000", the same with episodes weighted by their lengths; "goals0-4000", the goals in these steps; "at475", the step of the first evaluation of at
-        least 475; "until10000", the mean of the evaluations up to this step; or "train/KEY", the last value of a logged key
+        "area20000-40000", the same with episodes weighted by their lengths; "goals0-4000", the goals in these steps; "at475",
+        the step of the first evaluation of at least 475; "until10000", the mean of the evaluations up to this step; or
+        "train/KEY", the last value of a logged key
     :return: its value, NaN if the run does not have it; what was measured when the run was made comes first
     """
     if name in row.get("measures", {}):

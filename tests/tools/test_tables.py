@@ -36,8 +36,8 @@ def row(agent="a", game="Boxing", seed=0, score=1.0, **changes):
 
 
 def test_measures_by_hand():
-    names = ("score", "end", "goals", "first_goal", "return", "minutes", "20-60", "at9", "until50", "until100")
-    assert [measure(row(), name) for name in names] == [1.0, 4.0, 2.0, 25.0, 1.5, 1.0, 1.0, 50.0, 9.0, 5.0]
+    names = ("score", "end", "goals", "first_goal", "return", "minutes", "20-60", "goals0-60", "at9", "until50", "until100")
+    assert [measure(row(), name) for name in names] == [1.0, 4.0, 2.0, 25.0, 1.5, 1.0, 1.0, 1.0, 50.0, 9.0, 5.0]
     assert (
         np.isnan(measure(row(stopped_at=59), "20-60")) and np.isnan(measure(row(), "R2")) and np.isnan(measure(row(), "at10"))
     )
@@ -141,7 +141,7 @@ def test_verdicts_follow_from_the_intervals(tmp_path):
     assert differences(found).splitlines()[2:] == [
         "|[Pong](page.md)|1,000|5|4.0|1.0|3.0 [0.5, 5.5]|better with EqR|",
         "|[Pong](page.md)|1,000|5|4.0|1.0|3.0 [−1.0, 7.0]|no clear difference|",
-        "|[Pong](page.md)|1,000|5|0.29|0.39|−0.10 [−0.19, −0.01]|worse with EqR|",
+        "|[Pong](page.md)|1,000|5|0.28|0.39|−0.10 [−0.19, −0.01]|worse with EqR|",
     ]
     forest(found, tmp_path / "differences.png")
     assert (tmp_path / "differences.png").stat().st_size > 1_000
