@@ -336,15 +336,15 @@ def main() -> None:
         print(still())
         return
     runs = read(args.paths)
+    if args.pack is not None:
+        lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
+        with atomic_write(args.pack, "xz") as out:
+            out.write(lzma.compress("".join(lines).encode()))
     if args.greedy:  # older runs were not evaluated
         runs = {key: {seed: run for seed, run in found.items() if "greedy" in run} for key, found in runs.items()}
         runs = {key: found for key, found in runs.items() if found}
     if args.to not in (arms := sorted({arm for _, arm in runs})):
         parser.error(f"--to must be one of {arms}, got {args.to!r}")
-    if args.pack is not None:
-        lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
-        with atomic_write(args.pack, "xz") as out:
-            out.write(lzma.compress("".join(lines).encode()))
     if args.figure is not None:
         label = {"eqr_sac": "EqRSAC", "none": "EqRSAC, first version"}.get(args.drawn, args.drawn)
         draw(rows(runs, [args.drawn, "sac"]), "return", args.figure, [label, "SAC"])

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from scipy.stats import ttest_ind
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from experiments import markdown
 from experiments.continuous import Episodes
+from experiments.tables import area, difference, mean_and_error
 from sb3_eqr import EqRQRDQN, load_configuration
 from sb3_eqr.common.actor_critic_policies import LatentReader
 from sb3_eqr.common.groups.layer import GroupLayer
@@ -136,11 +136,6 @@ def read(file: pathlib.Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (lzma.open(file, "rt") if file.suffix == ".xz" else file.open())]
 
 
-def area(run: dict[str, Any]) -> float:
-    """The mean return in training: each finished episode weighs as many steps as it has."""
-    return float(np.average(run["training"]["score"], weights=run["training"]["length"]))
-
-
 def report(runs: list[dict[str, Any]]) -> str:
     """Final scores and returns in training: means, and the difference from the agent without EqR with its 95% interval."""
     lines = []
@@ -149,12 +144,8 @@ def report(runs: list[dict[str, Any]]) -> str:
             own, off = ([run for run in runs if (run["task"], run["arm"]) == (task, name)] for name in (arm, "off"))
             cells = [task, arm, str(len(own))]
             for measure in (lambda run: run["score"], area):
-                values, others = ([measure(run) for run in found] for found in (own, off))
-                cell = f"{np.mean(values):.1f}" if values else ""
-                if arm != "off" and min(len(values), len(others)) > 1:
-                    low, high = ttest_ind(values, others, equal_var=False).confidence_interval()
-                    cell += f" ({np.mean(values) - np.mean(others):.1f} [{low:.1f}, {high:.1f}])"
-                cells.append(cell)
+                values, others = (np.array([measure(run) for run in found]) for found in (own, off))
+                cells.append(mean_and_error(values) + (difference(values, others) if arm != "off" else ""))
             if own:
                 lines.append([*cells, f"{np.mean([run['cpu_seconds'] for run in own]):.0f}"])
     return markdown(["task", "arm", "seeds", "final score", "return in training", "CPU seconds"], lines)

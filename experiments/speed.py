@@ -25,7 +25,7 @@ from torch.utils.benchmark import Timer
 from torch.utils.flop_counter import FlopCounterMode
 
 from experiments import workload
-from experiments.workload import AGENTS, BATCH_SIZE, BEFORE, EQR_AGENTS, NETWORKS, OFF, Table, median, take_turns
+from experiments.workload import AGENTS, BATCH_SIZE, EQR_AGENTS, NETWORKS, OFF, Table, median, take_turns
 from sb3_eqr.common.saving.files import atomic_write
 
 TOLERANCE = 1e-5  # of parameters, if eager updates are deterministic
@@ -37,17 +37,15 @@ Row = dict[str, Any]
 
 def measure_updates(args: argparse.Namespace) -> Iterator[Table]:
     """An update of each agent on each network, compared with QRDQN's."""
-    for key in args.network or NETWORKS:
+    for key in args.network:
         n_updates, models = NETWORKS[key].n_updates, {name: workload.make_trainable(name, key, N_BEFORE) for name in AGENTS}
         updates = {name: partial(model.train, N_COUNTED, model.batch_size) for name, model in models.items()}
         counted = {name: workload.count_operations(call) / N_COUNTED for name, call in updates.items()}
         calls = {name: partial(model.train, n_updates, model.batch_size) for name, model in models.items()}
         found, rows = take_turns(calls, args.rounds, n_updates), []
         for name, model in models.items():
-            before = found.get(name + BEFORE)
             row = {"name": name, "ms": median(found[name].ms), "cpu_ms": median(found[name].cpu_ms)}
-            row |= {"times_QRDQN": found[name].ratio(found["QRDQN"])}
-            row |= {"times_before": found[name].ratio(before) if before else None, "operations": counted[name]}
+            row |= {"times_QRDQN": found[name].ratio(found["QRDQN"]), "operations": counted[name]}
             rows.append(row | {"bytes_per_transition": workload.bytes_per_transition(model) if key == "atari" else None})
         yield Table(f"updates_{key}", f"Update, {key}, batch {NETWORKS[key].batch_size}", rows)
 
@@ -58,9 +56,7 @@ def measure_graph(args: argparse.Namespace) -> Iterator[Table]:
     for name in EQR_AGENTS:
         agents = []
         for graph in (False, False, True):
-            agents.append(workload.make_agent(name, device=args.device, cuda_graph=graph))  # which seeds the generators
-            workload.fill(agents[-1].replay_buffer, workload.N_STORED)
-            agents[-1].train(N_BEFORE, agents[-1].batch_size)
+            agents.append(workload.make_trainable(name, n_updates=N_BEFORE, device=args.device, cuda_graph=graph))
         eager, again, captured = (th.cat([p.detach().flatten() for p in one.policy.parameters()]) for one in agents)
         apart_again, apart = (again - eager).abs().max().item(), (captured - eager).abs().max().item()
         failure = agents[2]._captured.failure
@@ -93,7 +89,7 @@ def measure_parts(args: argparse.Namespace) -> Iterator[Table]:
     rows_by_width, square = th.rand(5 * BATCH_SIZE, 256), th.rand(256, 256)  # M rows of each sample, hidden units
     product = Timer("a @ b", globals={"a": rows_by_width, "b": square}, num_threads=args.threads)
     rate = 2e-9 * 256 * rows_by_width.numel() / product.blocked_autorange().median
-    for key in args.network or NETWORKS:
+    for key in args.network:
         rows: list[Row] = []
         for name in ("QRDQN", AGENT + OFF, AGENT):
             model = workload.make_trainable(name, key, N_BEFORE)
@@ -127,24 +123,16 @@ PARTS = {"updates": measure_updates, "graph": measure_graph, "parts": measure_pa
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the given arguments, or else the command line; argparse reports wrong ones."""
     parser = argparse.ArgumentParser(prog="python -m experiments.speed", description=__doc__.strip().split("\n")[0])
-    several = partial(str.split, sep=",")
-    parser.add_argument("--only", type=several, default=["updates"], help=f"some of {', '.join(PARTS)}")
-    parser.add_argument("--network", type=several, help=f"of updates and parts: some of {', '.join(NETWORKS)}; default: all")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=["updates"])
+    parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS), help="of updates and parts")
     parser.add_argument("--threads", type=int, default=th.get_num_threads(), help="PyTorch threads")
     parser.add_argument("--rounds", type=int, default=20, help="number of rounds")
     parser.add_argument("--device", default="cpu", help="of graph: cuda, or cpu to test the script")
-    parser.add_argument("--before", metavar="DIR", help="a checkout of another version, measured alternately with this one")
     parser.add_argument("--json", metavar="FILE", help="also write all tables to this file")
     args = parser.parse_args(arguments)
-    for option, known in (("only", PARTS), ("network", NETWORKS)):
-        for name in getattr(args, option) or []:
-            if name not in known:
-                parser.error(f"--{option} must be some of {', '.join(known)}, got {name!r}")
     for option in ("threads", "rounds"):
         if getattr(args, option) < 1:
             parser.error(f"--{option} must be an integer >= 1, got {getattr(args, option)}")
-    if args.before and not (pathlib.Path(args.before) / "sb3_eqr" / "__init__.py").is_file():
-        parser.error(f"--before must be a folder with sb3_eqr in it, got {args.before!r}")
     return args
 
 
@@ -166,8 +154,6 @@ def main() -> None:
     """Parse the command line, measure, print, write."""
     args = parse()
     th.set_num_threads(args.threads)
-    if args.before:
-        workload.add_before(args.before)
     about = surroundings(args)
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     print(f"{about['cpu']}, {args.threads} thread(s), {args.rounds} rounds, {versions}")

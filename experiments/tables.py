@@ -100,7 +100,8 @@ def series(row: Row, what: str) -> tuple[np.ndarray, np.ndarray]:
     edges = np.linspace(0, row["protocol"]["steps"], PARTS + 1)
     if what in (kept := row.get("tenths", {})):
         return edges[1:][-len(kept[what]) :], np.array(kept[what])
-    table = pd.DataFrame(row["training"] if what in ("return", "goals") else row["losses"]).rename(columns={"score": "return"})
+    episodes = {"step": row["training"]["step"], "return": row["training"]["score"]}
+    table = pd.DataFrame(episodes if what in ("return", "goals") else row["losses"])
     if what == "goals":
         return edges[1:], np.histogram(table["step"][table["return"] > 0], edges)[0]
     if what not in table:
@@ -111,11 +112,6 @@ def series(row: Row, what: str) -> tuple[np.ndarray, np.ndarray]:
 def goals(row: Row) -> list[int]:
     """:return: steps at which an episode ended with a positive return"""
     return [step for step, score in zip(row["training"]["step"], row["training"]["score"], strict=True) if score > 0]
-
-
-def last(row: Row, key: str) -> float:
-    """:return: the last value that was logged under a key"""
-    return next((logged[key] for logged in reversed(row["losses"]) if key in logged), np.nan)
 
 
 MEASURES: dict[str, Callable[[Row], float]] = {
@@ -142,7 +138,7 @@ def measure(row: Row, name: str) -> float:
     if name in MEASURES:
         return float(MEASURES[name](row))
     if name.startswith("train/"):
-        return float(last(row, name[6:]))
+        return float(next((logged[name[6:]] for logged in reversed(row["losses"]) if name[6:] in logged), np.nan))
     if name.startswith(("at", "until")):
         steps, scores = evaluation_curve(row)
         limit = float(name.removeprefix("until").removeprefix("at"))

@@ -1,15 +1,9 @@
 """What the speed script measures and how: agents, random frames; clocks, tables."""
 
-import importlib
-import pathlib
-import sys
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
-from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +24,7 @@ SIZE, N_STACK, N_ACTIONS = 84, 4, 6  # Atari's frames, Pong's actions
 BATCH_SIZE = 32  # Table 5, and SB3's default
 EPISODE = 250  # steps; about the time between lost lives in an Atari game
 BUFFER_SIZE, N_STORED = 3_000, 1_100  # transitions
-OFF, BFLOAT16, BEFORE = ", group and losses off", ", bfloat16 targets", " (before)"
+OFF, BFLOAT16 = ", group and losses off", ", bfloat16 targets"
 EQR_AGENTS = ("EqRQRDQN", "EqRRainbow")
 
 
@@ -51,6 +45,7 @@ def random_frames(size: int, n_channels: int, n_actions: int) -> FakeImageEnv:
     """Random images (size, size, n_channels), no emulator."""
     game = FakeImageEnv(n_actions, size, size, n_channels=n_channels, discrete=True)
     game.ep_length = EPISODE
+    game.observation_space.seed(0)  # which draws the images, and which reset(seed) does not seed
     return game
 
 
@@ -64,33 +59,9 @@ NETWORKS = {
     "minatar": Network("CnnPolicy", MINATAR, policy_kwargs=SMALL, qrdqn=FEW, eqr=STILL),
     "cartpole": Network("MlpPolicy", CARTPOLE, batch_size=64, policy_kwargs={"net_arch": [256]}, qrdqn=FEW),
 }
-# Name -> class, and the convolutional extractor of its package.
 ALGORITHMS: tuple[type[Any], ...] = (DQN, QRDQN, EqRQRDQN, EqRRainbow)
-AGENTS = {algorithm.__name__: (algorithm, ConvExtractor) for algorithm in ALGORITHMS}
+AGENTS = {algorithm.__name__: algorithm for algorithm in ALGORITHMS}
 AGENTS |= {name + OFF: AGENTS[name] for name in EQR_AGENTS} | {"EqRRainbow" + BFLOAT16: AGENTS["EqRRainbow"]}
-
-
-def add_before(folder: str) -> None:
-    """Add the EqR agents of a checkout of another version of the package to ``AGENTS``, as "... (before)"."""
-
-    def forget() -> dict[str, ModuleType]:
-        return {name: sys.modules.pop(name) for name in list(sys.modules) if name.partition(".")[0] == "sb3_eqr"}
-
-    current = forget()
-    with mock.patch.object(sys, "path", [str(pathlib.Path(folder).resolve()), *sys.path]), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its environments override the registered ones
-        package = importlib.import_module("sb3_eqr")
-        extractor = importlib.import_module("sb3_eqr.common.networks.encoders").ConvExtractor
-    forget()
-    sys.modules.update(current)
-    AGENTS.update({name + off + BEFORE: (getattr(package, name), extractor) for off in ("", OFF) for name in EQR_AGENTS})
-
-
-def make_env(network: str) -> VecEnv:
-    """The network's environment, with stacked frames if ``n_stack`` is above 1."""
-    game = NETWORKS[network]
-    env = DummyVecEnv([game.make_game])
-    return VecFrameStack(env, game.n_stack) if game.n_stack > 1 else env
 
 
 def make_agent(
@@ -98,10 +69,10 @@ def make_agent(
 ) -> Any:
     """Create an agent of ``AGENTS`` that logs nothing, with a small and empty replay buffer; arguments override those of
     the network."""
-    (algorithm, conv_extractor), settings = AGENTS[name], NETWORKS[network]
+    settings = NETWORKS[network]
     layers = {**settings.policy_kwargs, **(settings.qrdqn if name == "QRDQN" else {}), **(policy_kwargs or {})}
     if "features_extractor_kwargs" in layers:
-        layers["features_extractor_class"] = conv_extractor
+        layers["features_extractor_class"] = ConvExtractor
     arguments = {"buffer_size": BUFFER_SIZE, "batch_size": settings.batch_size, "seed": 0, "device": "cpu"}
     arguments |= settings.eqr if name.startswith(EQR_AGENTS) else {}
     if BFLOAT16 in name:
@@ -109,8 +80,10 @@ def make_agent(
     if OFF in name:
         layers["group"] = None
         arguments |= {"aet_coef": 0.0, "symmetry_coef": 0.0, "reward_coef": 0.0}
-    env = make_env(network) if env is None else env
-    model = algorithm(settings.policy, env, **{**arguments, **kwargs}, policy_kwargs=layers)
+    if env is None:
+        env = DummyVecEnv([settings.make_game])
+        env = VecFrameStack(env, settings.n_stack) if settings.n_stack > 1 else env
+    model = AGENTS[name](settings.policy, env, **{**arguments, **kwargs}, policy_kwargs=layers)
     model.set_logger(configure(None, []))
     return model
 
@@ -123,18 +96,6 @@ def make_trainable(name: str, network: str = "atari", n_updates: int = 3, **kwar
     model.learning_starts, model.exploration_rate = starts, 0.0
     model.train(n_updates, model.batch_size)
     return model
-
-
-def fill(buffer: Any, n_adds: int) -> None:
-    """Add random frames, the same each time, to a buffer of stacks (4, 84, 84), with ``n_adds`` calls of ``add``."""
-    rng, n_envs = np.random.default_rng(0), buffer.n_envs
-    stack = np.zeros((n_envs, N_STACK, SIZE, SIZE), dtype=np.uint8)
-    for step in range(n_adds):
-        frame = rng.integers(0, 256, (n_envs, 1, SIZE, SIZE), dtype=np.uint8)
-        next_stack = np.concatenate([stack[:, 1:], frame], axis=1)
-        done = np.full(n_envs, step % EPISODE == EPISODE - 1)
-        buffer.add(stack, next_stack, rng.integers(0, N_ACTIONS, n_envs), rng.integers(-1, 2, n_envs), done, [{}] * n_envs)
-        stack = next_stack
 
 
 def bytes_per_transition(model: Any) -> float:

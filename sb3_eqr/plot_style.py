@@ -1,7 +1,7 @@
 """The style of all plots of this package. Curves differ in line style and marker as well as in colour."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -48,8 +48,6 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
     }
 
 
-@contextmanager
-def styled() -> Iterator[None]:
+def styled() -> AbstractContextManager[None]:
     """Apply Matplotlib's settings for these plots, and restore the previous ones afterwards."""
-    with matplotlib.rc_context(SETTINGS):
-        yield
+    return matplotlib.rc_context(SETTINGS)

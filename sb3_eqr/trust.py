@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 PASS_TRUST = "If you know where the file comes from, pass --trust."
 # A file may name the wrappers of these modules, except those that write files.
 WRAPPERS: tuple[str, ...] = ("sb3_eqr.envs.", "stable_baselines3.common.atari_wrappers.", "stable_baselines3.common.vec_env.")
-WRAPPERS += ("sb3_contrib.common.wrappers.", "gymnasium.wrappers.", "rl_zoo3.wrappers.")
+WRAPPERS += ("sb3_contrib.common.wrappers.", "gymnasium.wrappers.", "rl_zoo3.wrappers.", "rl_zoo3.gym_patches.")
 EVALUATED = ("normalize", "policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")  # strings that RL Zoo evaluates
 IMPORTED = ("policy", "replay_buffer_class", "callback")  # names that it imports
 # The syntax of plain values, and calls, of which only those of dict are allowed.

@@ -36,7 +36,7 @@ def find_agent(text: str) -> Agent:
     """
     :param text: ALGO or ALGO:ENTRIES. ALGO alone uses RL Zoo's hyperparameters for a stock algorithm, ours for an EqR agent.
         ENTRIES is "stock" (zoo_hyperparams/stock), "off" (an EqR agent without group and auxiliary losses), the name of one
-        of our files, an unambiguous prefix of such a name ("mlp" for "mlp+aet+r"), or the path of a YAML file with entries,
+        of our files, or the path of a YAML file with entries,
         or with ``base``, the ENTRIES or file to start from, and ``changes``; FILE:NAME is one of several of these in a file
     :raises ValueError: for an unknown algorithm or file, with the nearest name
     """
@@ -55,21 +55,13 @@ def find_agent(text: str) -> Agent:
         if not pathlib.Path(match[1]).is_file():
             raise ValueError(f"--agents: {text!r}: there is no file {match[1]}")
         return _agent_of_file(algo, pathlib.Path(match[1]).resolve(), match[2])
-    name = f"{STOCK}/{algo}" if entries == STOCK else entries
-    if name not in files:
-        ours = [key for key in files if key not in AGENTS and not key.startswith(f"{STOCK}/")]
-        legal = ours if algo in AGENTS else []
-        longer = sorted(key for key in legal if key.startswith(entries))
-        if len(longer) > 1:
-            raise ValueError(
-                f"--agents: {text!r} must be a prefix of one name, got one of {', '.join(longer)}. Choose one of them."
-            )
-        if not longer:
-            legal += [STOCK] * (f"{STOCK}/{algo}" in files) + [OFF] * (algo in AGENTS)
-            choices = nearest_name(entries, legal) if legal else f" Use {algo!r} alone, or a YAML file."
-            raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{choices}")
-        entries = name = longer[0]
-    return Agent(f"{algo}:{entries}", algo, files[name])
+    named = {key.removesuffix(f"/{algo}"): file for key, file in files.items() if "/" not in key or key == f"{STOCK}/{algo}"}
+    if entries not in named:
+        ours = [*(key for key in named.keys() - AGENTS.keys() if key != STOCK), OFF] if algo in AGENTS else []
+        legal = [*ours, *({STOCK} & named.keys())]
+        choices = nearest_name(entries, legal) if legal else f" Use {algo!r} alone, or a YAML file."
+        raise ValueError(f"--agents: {text!r}: there are no hyperparameters {entries!r}.{choices}")
+    return Agent(text, algo, named[entries])
 
 
 def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Agent:
@@ -89,9 +81,20 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
         if name is not None:
             raise ValueError(f"--agents: {file}: {name!r} must be a mapping with base and changes, got {found!r:.60}.")
         return Agent(label, algo, file)
-    beside = file.parent / str(found["base"])
-    base = _agent_of_file(algo, beside) if beside.is_file() else find_agent(f"{algo}:{found['base']}")
-    return Agent(label, algo, base.file, merged(base.changes, found.get("changes", {})))
+    start, changes = (
+        OFF if found["base"] is False else str(found["base"]),
+        found.get("changes") or {},
+    )  # YAML reads off as False
+    if not isinstance(changes, dict):
+        raise ValueError(f"--agents: {file}: changes must be a mapping, got {changes!r:.60}.")
+    beside, _, of_several = start.partition(":")
+    if (file.parent / beside).is_file():
+        if (file.parent / beside).resolve() == file and (of_several or None) == name:
+            raise ValueError(f"--agents: {file}: base must be another agent, got this one.")
+        base = _agent_of_file(algo, (file.parent / beside).resolve(), of_several or None)
+    else:
+        base = find_agent(f"{algo}:{start}")
+    return Agent(label, algo, base.file, merged(base.changes, changes))
 
 
 def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:

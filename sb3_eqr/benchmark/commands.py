@@ -9,6 +9,7 @@ import sys
 import time
 from typing import Any
 
+import gymnasium as gym
 from rich.console import Console
 
 from sb3_eqr.benchmark.agents import find_agent
@@ -159,7 +160,7 @@ def status(args: argparse.Namespace) -> None:
 
 def report(args: argparse.Namespace) -> None:
     """Write the report."""
-    from sb3_eqr.benchmark.report import write_report  # rliable and seaborn take seconds to import
+    from sb3_eqr.benchmark.report import write_report  # rliable takes seconds to import
 
     references = {}
     for text in args.reference:
@@ -182,7 +183,7 @@ def execute(args: argparse.Namespace) -> None:
     """Run a command and exit with its status, or with a message and status 2 if the user has to do something."""
     try:
         sys.exit(int({"run": run, "status": status, "report": report, "pack": pack_runs}[args.command](args) or 0))
-    except (ValueError, ImportError, ConnectionError, OSError) as error:
+    except (ValueError, ImportError, OSError, gym.error.Error) as error:
         fail(f"benchmark {args.command}: {error}")
     except KeyboardInterrupt:
         fail("interrupted. The same command continues: runs resume from their last checkpoint, or start again without one.")

@@ -4,7 +4,6 @@ of a ``protocol`` see :meth:`~sb3_eqr.benchmark.suites.Suite.protocol`.
 """
 
 import copy
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,7 @@ from gymnasium.wrappers import NormalizeReward, TimeLimit
 from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.atari_wrappers import EpisodicLifeEnv, WarpFrame
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.env_util import is_wrapped, make_vec_env
+from stable_baselines3.common.env_util import is_wrapped, make_vec_env, unwrap_wrapper
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
@@ -53,21 +52,17 @@ def make_game(protocol: dict[str, Any]) -> gym.Env:
     return env if max_steps is None else TimeLimit(env, max_steps)
 
 
-def layers(env: gym.Env) -> Iterator[gym.Env]:
-    """The wrappers of an environment, the outermost first."""
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
-
-
 def check_game(protocol: dict[str, Any]) -> spaces.Space:
     """
     :return: the action space
     :raises ValueError: if evaluation would not see full episodes and raw scores
     """
-    env = make_game(protocol)
+    try:
+        env = make_game(protocol)
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"{protocol['env_id']}: {error}") from error
     changing = (gym.RewardWrapper, NormalizeReward, EpisodicLifeEnv)  # SB3's ClipRewardEnv is a RewardWrapper
-    found = [type(layer).__name__ for layer in layers(env) if isinstance(layer, changing)]
+    found = [type(layer).__name__ for kind in changing if (layer := unwrap_wrapper(env, kind))]
     if "AtariEnv" in str(gym.spec(protocol["env_id"]).entry_point) and not is_wrapped(env, WarpFrame):
         found.append("no preprocessing")
     env.close()

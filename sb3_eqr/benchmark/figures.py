@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rliable import plot_utils
@@ -172,42 +171,29 @@ def _sample_efficiency(analysis: Analysis, style: Mapping[str, Look]) -> list[Re
 
 def _learning_curves(comparison: Comparison, style: Mapping[str, Look]) -> list[ReportFigure]:
     """A panel per game: mean and standard deviation over runs, without those that were evaluated only at the end."""
-    frames = []
+    found = {}
     for run in comparison.results:
         steps, scores = evaluation_curve(run)
         if len(steps) > 1:
-            agent = comparison.label(run["agent"])
-            curve = {"game": run["game"], "agent": agent, "seed": run["seed"], "step": steps / 1_000, "score": scores}
-            frames.append(pd.DataFrame(curve))
-    if not frames:
+            found[run["game"], comparison.label(run["agent"]), run["seed"]] = pd.Series(scores, steps / 1_000)
+    if not found:
         return []
-    table = pd.concat(frames, ignore_index=True)
-    shown = {agent: look for agent, look in style.items() if agent in set(table["agent"])}
-    grid = sns.relplot(
-        table,
-        x="step",
-        y="score",
-        col="game",
-        hue="agent",
-        style="agent",
-        palette={agent: look.color for agent, look in shown.items()},
-        markers={agent: look.marker for agent, look in shown.items()},
-        kind="line",
-        errorbar="sd",
-        markeredgewidth=0,
-        col_wrap=min(3, table["game"].nunique()),
-        height=2.1,
-        aspect=1.25,
-        legend=False,
-        facet_kws={"sharey": False},
-    )
-    for ax in grid.axes.flat:
-        for line, look in zip(ax.get_lines(), shown.values(), strict=False):
-            line.set_linestyle(look.line)
-    grid.figure.set_layout_engine("constrained")
-    grid.set(xlim=(0, None))
-    grid.set_titles("{col_name}").set_axis_labels("steps (thousands)", "mean raw score")
-    _legend(grid.figure, shown)
+    table = pd.DataFrame(found).T  # runs by steps
+    games, agents, seeds = (table.index.unique(level) for level in range(3))
+    n_columns = min(3, len(games))
+    n_rows = -(-len(games) // n_columns)
+    size = (2.6 * n_columns, 2.1 * n_rows + 0.4)
+    figure, axes = plt.subplots(n_rows, n_columns, figsize=size, squeeze=False, layout="constrained")
+    for ax, game in zip(axes.flat, games, strict=False):
+        for agent, curves in table.loc[game].groupby(level=0):
+            mean = curves.mean().dropna()
+            deviation = curves.std().fillna(0)[mean.index]
+            _draw(ax, mean.index.to_numpy(), (mean, mean - deviation, mean + deviation), style[agent])
+        ax.set(title=game, xlabel="steps (thousands)", xlim=(0, None))
+    for unused in axes.flat[len(games) :]:
+        unused.remove()
+    axes[0, 0].set_ylabel("mean raw score")
+    _legend(figure, {agent: look for agent, look in style.items() if agent in agents})
     caption = "Raw scores of the evaluations during training. "
-    caption += "Means over runs ± one standard deviation." if table["seed"].nunique() > 1 else "A single run each."
-    return [ReportFigure("learning_curves", "Learning curves", caption, grid.figure)]
+    caption += "Means over runs ± one standard deviation." if len(seeds) > 1 else "A single run each."
+    return [ReportFigure("learning_curves", "Learning curves", caption, figure)]

@@ -10,7 +10,8 @@ import re
 import shlex
 from typing import Any
 
-from pydantic import BaseModel, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import FiniteFloat, NonNegativeInt, PositiveInt, TypeAdapter, ValidationError
+from typing_extensions import TypedDict  # pydantic needs this one below Python 3.12
 
 from sb3_eqr.benchmark.runs import RESULT, STOPPED, SUITE
 from sb3_eqr.benchmark.suites import Evaluation, Suite, first_mistake, merge, read_suite
@@ -21,52 +22,20 @@ ABSOLUTE = re.compile(r"(?<![\w./])/(?:[\w.@+-]+/)+(?=[\w.@+-])")  # the folders
 WHOLE = re.compile(r"(?<![\w./])/(?:[^/:]+/)+(?=[^/])")  # and of one that may have any letters, in a word of a command line
 
 
-class Checked(BaseModel, strict=True):
-    """A model that rejects values of another type; more keys are legal."""
+# What a report needs of a run; rows have more keys.
+Episodes = list[FiniteFloat]  # their scores
+Steps = list[NonNegativeInt]  # at which they ended, or their lengths
+Evaluated = TypedDict("Evaluated", {"step": NonNegativeInt, "kind": str, "scores": Episodes, "lengths": Steps})
+Trained = TypedDict("Trained", {"step": Steps, "score": Episodes, "length": Steps})
+Protocol = TypedDict(
+    "Protocol", {"env_id": str, "steps": PositiveInt, "preprocessing": dict[str, Any], "evaluation": Evaluation}
+)
+Entry = TypedDict("Entry", {"algo": str, "hyperparameters": dict[str, Any]})
+Machine = TypedDict("Machine", {"device": str, "threads": PositiveInt})
 
 
-class Evaluated(Checked):
-    """One evaluation: ``kind`` is "curve" or "final"; scores and lengths of its episodes."""
-
-    step: NonNegativeInt
-    kind: str
-    scores: list[FiniteFloat]
-    lengths: list[NonNegativeInt]
-
-
-class Trained(Checked):
-    """The episodes of training: the step at which each ended, its score and length."""
-
-    step: list[NonNegativeInt]
-    score: list[FiniteFloat]
-    length: list[NonNegativeInt]
-
-
-class Protocol(Checked):
-    """How the game was played."""
-
-    env_id: str
-    steps: PositiveInt
-    preprocessing: dict[str, Any]
-    evaluation: Evaluation
-
-
-class Entry(Checked):
-    """The agent."""
-
-    algo: str
-    hyperparameters: dict[str, Any]
-
-
-class Machine(Checked):
-    """What it was trained on."""
-
-    device: str
-    threads: PositiveInt
-
-
-class Row(Checked):
-    """What a report needs of a run; rows have more."""
+class Row(TypedDict):
+    """A run."""
 
     agent: str
     game: str
@@ -81,10 +50,13 @@ class Row(Checked):
     attempts: NonNegativeInt
     wall_clock_s: FiniteFloat
     steps_per_second: FiniteFloat
-    resumed_at: list[NonNegativeInt]
+    resumed_at: Steps
     evaluations: list[Evaluated]
     training: Trained
     losses: list[dict[str, float | None]]
+
+
+ROW = TypeAdapter(Row)
 
 
 def read(path: pathlib.Path) -> tuple[Suite, list[dict[str, Any]]]:
@@ -121,7 +93,7 @@ def _row(text: str) -> dict[str, Any]:
     """:raises ValueError: with the first mistake, if the text is not the row of a run"""
     row = json.loads(text)
     try:
-        Row.model_validate(row)
+        ROW.validate_python(row, strict=True)
     except ValidationError as error:
         raise ValueError(first_mistake(error).removesuffix(".")) from error
     return row

@@ -331,11 +331,9 @@ def execute(run: Run, settings: Settings) -> str:
             (run.folder / ERROR).unlink(missing_ok=True)  # of an earlier attempt
             try:
                 outcome = train(run, settings)
-            except (Exception, SystemExit) as error:
+            except Exception:
                 with contextlib.suppress(OSError), atomic_write(run.folder / ERROR, "txt") as file:
                     file.write(traceback.format_exc().encode())
-                if isinstance(error, SystemExit):  # would also end Ray's worker
-                    raise RuntimeError(f"{run.agent.file} cannot be used (exit {error.code})") from error
                 raise
             (run.folder / PROGRESS).unlink(missing_ok=True)
             return outcome

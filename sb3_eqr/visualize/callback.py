@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import CSVOutputFormat, Figure, HumanOutputFormat, JSONOutputFormat
+from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
 
 from sb3_eqr.common.checks.arguments import check, integer
 from sb3_eqr.common.off_policy import EqROffPolicy
@@ -12,7 +12,6 @@ from sb3_eqr.visualize.diagnostics import diagnose
 from sb3_eqr.visualize.latents import check_agent, encode, group_model, replayed
 from sb3_eqr.visualize.pictures import latent_figure
 
-NO_PICTURES = (CSVOutputFormat, HumanOutputFormat, JSONOutputFormat)
 EXCLUDED = ("csv", "stdout", "log", "json")  # their names; "log": HumanOutputFormat writing to a file
 
 
@@ -32,7 +31,7 @@ class LatentCallback(BaseCallback):
     :param log_freq: Log every ``log_freq`` steps, counted over all environments. This also dumps the logger, as SB3's
         ``EvalCallback`` does
     :param n_windows: Number of windows, drawn with replacement
-    :param pictures: Whether to log the figure, if the logger supports figures (TensorBoard does)
+    :param pictures: Whether to log the figure, if the logger writes for TensorBoard
     :param verbose: Verbosity level: 0 for no output, 1 for a line each time it logs
     :raises ValueError: for an argument out of range, or, when training starts, if the agent is not an EqR agent, or has
         SPR's convolutional transition
@@ -80,7 +79,7 @@ class LatentCallback(BaseCallback):
         for name, value in {**found.scalars, "symmetry_distance": symmetry}.items():
             if np.isfinite(value) and name != "dimensions":
                 self.logger.record(f"latent/{name}", value)
-        if self.pictures and any(type(kind) not in NO_PICTURES for kind in self.logger.output_formats):
+        if self.pictures and any(isinstance(kind, TensorBoardOutputFormat) for kind in self.logger.output_formats):
             ages = (buffer.pos - 1 - play.samples.indices // buffer.n_envs) % buffer.buffer_size
             figure = latent_figure(self.model, encode(self.model, play.samples.observations), ages, "steps ago")
             self.logger.record("latent/blocks", Figure(figure, close=False), exclude=EXCLUDED)

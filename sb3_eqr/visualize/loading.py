@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
@@ -93,7 +94,8 @@ def make_env(
             raise ValueError(f"--env-kwargs must be empty for Atari, whose protocol is fixed, got {kwargs}.")
         env = make_atari100k_env(env_id, n_envs, seed, training=True, render_mode="rgb_array" if render else None)
     else:
-        env = _plain_env(env_id, kwargs, n_envs, seed, render)
+        check_registered(env_id, "--env")
+        env = _make_envs(env_id, kwargs, n_envs, seed, render, None)
     statistics = path.parent / "vecnormalize.pkl"
     if unwrap_vec_normalize(env) is None and statistics.is_file():
         if not trust:
@@ -133,21 +135,11 @@ def _make_envs(
 ) -> VecEnv:
     """Environments that render if asked and able to."""
     make = partial(make_vec_env, partial(gym.make, env_id), n_envs, seed, wrapper_class=wrap)  # by name, all would render
-    if not render or "render_mode" in kwargs:
-        return make(env_kwargs=kwargs)
     try:
-        return make(env_kwargs={"render_mode": "rgb_array", **kwargs})
+        return make(env_kwargs={"render_mode": "rgb_array", **kwargs} if render else kwargs)
     except TypeError as error:
-        if "render_mode" not in str(error):
-            raise
-        return make(env_kwargs=kwargs)
-
-
-def _plain_env(env_id: str, kwargs: dict[str, Any], n_envs: int, seed: int, render: bool) -> VecEnv:
-    check_registered(env_id, "--env")
-    try:
-        return _make_envs(env_id, kwargs, n_envs, seed, render, None)
-    except TypeError as error:
+        if render and "render_mode" in str(error):
+            return _make_envs(env_id, kwargs, n_envs, seed, False, wrap)
         raise ValueError(f"--env-kwargs: {env_id} does not accept {kwargs} ({error}).") from error
 
 
@@ -179,5 +171,5 @@ def action_names(env: VecEnv, model: EqROffPolicy) -> list[str]:
 def factor_names(env: VecEnv) -> list[str]:
     """Names of the factors that an environment reported at its last reset, in the order of ``Play``."""
     info = env.unwrapped.reset_infos[0]
-    sizes = {key: getattr(info[key], "size", 1) for key in FACTOR_KEYS if key in info}
+    sizes = {key: np.size(info[key]) for key in FACTOR_KEYS if key in info}
     return [key if size == 1 else f"{key} {i}" for key, size in sizes.items() for i in range(size)]

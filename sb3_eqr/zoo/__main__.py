@@ -22,7 +22,7 @@ from sb3_eqr.common.saving.files import temporary_folder
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.trust import check_statistics, check_zoo_folder
 from sb3_eqr.zoo import AGENTS, register
-from sb3_eqr.zoo.checks import check_device, check_environment, check_loggers, check_trained_agent, fail, failing
+from sb3_eqr.zoo.checks import check_device, check_environment, fail, failing
 from sb3_eqr.zoo.entries import check_entry, entry_name, read_entry, read_file
 from sb3_eqr.zoo.registration import trust_files
 from sb3_eqr.zoo.resuming import FOLDER, ResumableExperiment, checkpoints_of, config_of
@@ -30,10 +30,9 @@ from sb3_eqr.zoo.resuming import FOLDER, ResumableExperiment, checkpoints_of, co
 # Each command is a module of RL Zoo with a function of the same name, or a script.
 PLOTS = ("plot_train", "plot_from_file", "all_plots")
 SCRIPTS = ("record_video", "push_to_hub", "load_from_hub")
-COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 LOADING = ("enjoy", "record_video", "push_to_hub")
 # Errors of RL Zoo that may have a cause which the user can remove.
-MISTAKES = (ModuleNotFoundError, NotImplementedError, AssertionError, ValueError, TypeError, OSError)
+MISTAKES = (ImportError, NotImplementedError, AssertionError, ValueError, TypeError, OSError)
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 DOWNLOADS = "rl-trained-agents"  # enjoy's default folder, also for downloads
 
@@ -70,7 +69,7 @@ def own_parser() -> argparse.ArgumentParser:
 def parse(arguments: list[str]) -> argparse.Namespace:
     """:return: the arguments that are checked here; RL Zoo parses all arguments again"""
     parser = argparse.ArgumentParser(add_help=False, parents=[own_parser()])
-    parser.add_argument("--algo")
+    parser.add_argument("--algo", default="ppo")
     parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-conf", "--conf-file")
@@ -79,8 +78,6 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("-name", "--repo-name")  # of the hub; otherwise argparse reads -n ame
     parser.add_argument("--device", default="auto")
     parser.add_argument("-i", "--trained-agent", default="")
-    parser.add_argument("--track", action="store_true")
-    parser.add_argument("-tb", "--tensorboard-log", default="")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("-f", "--folder", default=DOWNLOADS)
     parser.add_argument("--exp-id", type=int, default=0)
@@ -97,19 +94,16 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 def prepare_training(args: argparse.Namespace) -> str | None:
     """Check the arguments of ``train``. Returns the file of hyperparameters to use; ``None``: RL Zoo's."""
-    algo = args.algo or "ppo"
-    path = find_hyperparameters(algo, args.conf_file)
+    path = find_hyperparameters(args.algo, args.conf_file)
     check_environment(args.env, args.gym_packages)
     check_device(args.device)
     if args.n_timesteps == 0:
         fail("-n must be >= 1 step, or -1 for the number in the file, got 0.")
-    check_loggers(args.track, args.tensorboard_log)
-    check_trained_agent(args.trained_agent)
     if args.trained_agent and not args.trust:
         with failing():
             check_statistics(pathlib.Path(args.trained_agent).parent / EnvironmentName(args.env) / "vecnormalize.pkl")
     if path is None:
-        check_entry(args.hyperparams, algo, "--hyperparams")
+        check_entry(args.hyperparams, args.algo, "--hyperparams")
         return None
     if args.resume is not None:
         with failing("--resume: "):
@@ -118,7 +112,7 @@ def prepare_training(args: argparse.Namespace) -> str | None:
     # as in RL Zoo, --env-kwargs replace those of the entry
     changes = {**args.hyperparams, **({"env_kwargs": args.env_kwargs} if args.env_kwargs else {})}
     entry = read_entry(path, args.env, changes)
-    check_entry(entry, algo, f"{path} with --hyperparams" if args.hyperparams else path)
+    check_entry(entry, args.algo, f"{path} with --hyperparams" if args.hyperparams else path)
     register(policy_kwargs=entry.get("policy_kwargs"))
     name = entry_name(read_file(path), args.env, changes)
     if not name.startswith("default-"):  # RL Zoo would use "default"
@@ -169,7 +163,7 @@ def check_runs(arguments: list[str]) -> None:
 
 def check_trained(args: argparse.Namespace) -> None:
     """Exit with a message if there is no trained agent at the given place, or if the files beside it would run code."""
-    algo, name = args.algo or "ppo", EnvironmentName(args.env)
+    algo, name = args.algo, EnvironmentName(args.env)
     which = (args.load_best, args.load_checkpoint, args.load_last_checkpoint)
     try:
         *_, folder = get_model_path(args.exp_id, args.folder, algo, name, *which)
@@ -231,24 +225,19 @@ def run(command: str, arguments: list[str]) -> None:
 
 def explanation(command: str, error: Exception) -> str | None:
     """:return: what the user can do about an error of RL Zoo; ``None`` for an error with another cause"""
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ImportError):
         advice = ' Run pip install ".[zoo]" in a clone of the repository.' if str(error.name).split(".")[0] in EXTRA else ""
         return f"{command}: {error}.{advice}"
     if isinstance(error, OSError) and error.errno in UNWRITABLE:
         return f"{command}: {error}. Free some space, or pass another folder with -f."
-    if "pass trust=True" in str(error) or str(error).startswith("observation_space"):
+    if "pass trust=True" in str(error) or str(error).startswith(("observation_space", "The trained_agent")):
         return f"{command}: {error}"
     if isinstance(error, gym.error.DependencyNotInstalled):
         return str(error)
     if "observation space is not supported" in str(error):
         return f"{command}: {error}. Wrap the environment so that it has Box or Discrete observations, or a Dict of these."
     if "as action space" in str(error):
-        advice = (
-            ""
-            if "Wrap the environment" in str(error)
-            else " EqRQRDQN and EqRRainbow need discrete actions, EqRSAC and EqRTQC continuous ones."
-        )
-        return f"{command}: {str(error).rstrip('.')}.{advice}"
+        return f"{command}: {error}"
     if command in PLOTS and not isinstance(error, (AssertionError, NotImplementedError)):
         return f"{command}: {error}. RL Zoo's plots need two runs of each agent, with two evaluations of two episodes each."
     if command == "load_from_hub" and "TRUST_REMOTE_CODE" in str(error):
@@ -263,13 +252,13 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
     if command in PLOTS:
         return arguments
     args, own = parse(arguments), own_parser()
-    if args.algo is not None and args.algo not in ALGOS:
+    if args.algo not in ALGOS:
         fail(f"--algo must be one of {', '.join(ALGOS)}, got {args.algo!r}.{nearest(args.algo, ALGOS)}")
     if command == "train":
         path = prepare_training(args)
         arguments = [*own.parse_known_args(arguments)[1], *prepare_resuming(args)]
         arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
-    elif command in LOADING and args.algo is not None:
+    elif command in LOADING:
         check_device(args.device)
         check_environment(args.env, args.gym_packages)  # imports the packages, for which two commands have no argument
         own.add_argument("--gym-packages", nargs="+")

@@ -1,7 +1,6 @@
 """Checks of the command line before RL Zoo starts, with messages that say what to do."""
 
 import importlib.util
-import pathlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -49,17 +48,3 @@ def check_device(device: str) -> None:
         fail(f"--device must be auto, cpu, cuda or another PyTorch device, got {device!r}.")
     if device.startswith("cuda") and not th.cuda.is_available():
         fail(f"--device is {device}, but PyTorch finds no GPU. Pass --device cpu, or leave it out.")
-
-
-def check_loggers(track: bool, tensorboard_log: str) -> None:
-    """Exit with a message if Weights & Biases or TensorBoard is asked for and not installed."""
-    if track and importlib.util.find_spec("wandb") is None:
-        fail("--track needs Weights & Biases. Run pip install wandb.")
-    if (track or tensorboard_log) and importlib.util.find_spec("tensorboard") is None:
-        fail(f"{'--track' if track else '--tensorboard-log'} needs TensorBoard. Run pip install tensorboard.")
-
-
-def check_trained_agent(path: str) -> None:
-    """Exit with a message if the trained agent to continue from does not exist."""
-    if path and not (path.endswith(".zip") and pathlib.Path(path).is_file()):
-        fail(f"--trained-agent must be the path of a .zip file, such as logs/eqr_qrdqn/ENV_1/ENV.zip, got {path!r}.")

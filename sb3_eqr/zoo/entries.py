@@ -93,16 +93,17 @@ def entry_name(entries: dict[str, Any], env_id: str, changes: dict[str, Any]) ->
         return "atari"
     if not any(name.startswith("default-") for name in entries):
         return "default"
-    with failing(f"{env_id}: ", (ValueError, TypeError, ImportError, AttributeError)):
+    with failing(f"{env_id}: ", (ValueError, TypeError, ImportError, AttributeError, gym.error.Error)):
         env = gym.make(env_id, **(changes.get("env_kwargs") or {}))
         wrap = get_wrapper_class(changes) if changes.get("env_wrapper") else None
         space = (env if wrap is None else wrap(env)).observation_space
     env.close()
+    name = "default"
     if isinstance(space, gym.spaces.Dict):
-        return "default-dict"
-    if not is_image_space(space):
-        return "default"
-    return "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_PICTURE else "default-image"
+        name = "default-dict"
+    elif is_image_space(space):
+        name = "default-small-image" if sorted(space.shape or ())[1] < SMALLEST_PICTURE else "default-image"
+    return name if name in entries else "default"
 
 
 def find_entry(path: str, env_id: str, changes: dict[str, Any]) -> dict[str, Any]:

@@ -161,6 +161,7 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
     :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
     :raises ValueError: if they name code of other packages
     """
+    path = path.resolve()
     for run in (path, path.parent, path.parent.parent):
         for config in sorted(run.glob("*/config.yml")):
             if not trust:

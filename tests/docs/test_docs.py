@@ -245,7 +245,7 @@ def check_script(call, arguments):
             raise Understood(parse_args(self, args, namespace))
 
         patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
-        for name in ("check_trained", "check_trained_agent", "check_runs", "save_where_nothing_is_shown"):
+        for name in ("check_trained", "check_runs", "save_where_nothing_is_shown"):
             patch.setattr(zoo_command, name, lambda argument: None)  # nothing is trained here
         for module, name in ((huggingface_hub, "HfApi"), (huggingface_sb3, "load_from_hub")):  # commands replace them for good
             patch.setattr(module, name, getattr(module, name))

@@ -189,7 +189,7 @@ RUN = "run b --suite tiny --suite-file own.yml --agents dqn:fast.yml"
         ("run b --suite smoke", "--suite and --agents must be given together"),
         ("run b", "got one without runs"),
         ("run b --steps 30", "--steps needs --suite and --agents"),
-        ("run b --suite smoke --agents eqr_rainbow:se2+aet+", "got one of se2+aet+get, se2+aet+r, se2+aet+r+get. Choose one"),
+        ("run b --suite smoke --agents dqn:stock/dqn", "no hyperparameters 'stock/dqn'. Did you mean 'stock'?"),
         ("run b --suite smoke --agents dqn:other.yml", "'dqn:other.yml': there is no file other.yml"),
         ("status b", "got one without runs"),
         (f"{RUN} --seeds 0", "--seeds must be >= 1, or different seeds >= 0 such as 1,3; got 0"),
@@ -341,6 +341,7 @@ def test_invalid_suites_raise(files, change, message):
     "preprocessing, message",
     [
         ({}, "evaluation must be on full episodes with raw scores, got no preprocessing"),
+        ({"env_wrapper": "gymnasium.wrappers.Nope"}, "PongNoFrameskip-v4: .*Nope"),
         ({"env_wrapper": "sb3_eqr.envs.atari.Atari100kWrapper"}, "raw scores, got ClipRewardEnv, EpisodicLifeEnv"),
         ({"env_wrapper": [{"sb3_eqr.envs.atari.Atari100kWrapper": {"training": False}}]}, "got its own frame_stack"),
     ],
@@ -416,7 +417,15 @@ def test_agents_and_their_files():
     assert find_agent("qrdqn:stock").file.parent.name == "stock"
     assert find_agent("eqr_rainbow").file.parent.name == "zoo_hyperparams"
     assert find_agent("eqr_rainbow:se2+aet").file.name == "se2+aet.yml"  # and not se2+aet+r
-    assert find_agent("eqr_rainbow:mlp").name == "eqr_rainbow:mlp+aet+r"
+
+
+def test_files_of_agents_build_on_each_other(tmp_path):
+    several = tmp_path / "several.yml"
+    several.write_text("one: {base: off, changes: {gamma: 0.9}}\ntwo: {base: several.yml:one, changes: {tau: 0.5}}\n")
+    (tmp_path / "other.yml").write_text("base: several.yml:two\nchanges:\n")
+    found = find_agent(f"eqr_rainbow:{tmp_path}/other.yml")  # from another folder
+    assert (found.name, found.file.name) == ("eqr_rainbow:other", "eqr_rainbow.yml")
+    assert found.changes == {"prediction_depth": 0, "policy_kwargs": {"group": None}, "gamma": 0.9, "tau": 0.5}
 
 
 @pytest.mark.parametrize(
@@ -425,6 +434,9 @@ def test_agents_and_their_files():
         ("[", None, r"own.yml must be valid YAML"),
         ("", "slow", r"own.yml must be a mapping, got None"),
         ("slow: {learning_rate: 0.5}", "slow", r"'slow' must be a mapping with base and changes, got \{'learning_rate': 0.5"),
+        ("base: own.yml", None, "base must be another agent, got this one"),
+        ("slow: {base: own.yml:slow}", "slow", "base must be another agent, got this one"),
+        ("{base: stock, changes: 3}", None, "changes must be a mapping, got 3"),
         ("a/b: {base: stock}", "a/b", r"must have no slashes, as it names a folder, got 'a/b'"),
     ],
 )

@@ -395,6 +395,19 @@ def test_one_agent_one_game_one_seed(tmp_path, report_of):
     assert found[-1].caption.endswith("A single run each.")
 
 
+def test_an_agent_without_a_curve_changes_no_other_line(tmp_path):
+    folder = a_benchmark(tmp_path / "a", {FULL: {"Pong": [1.0], "Boxing": [1.0]}, BASE: {"Pong": [2.0], "Boxing": [2.0]}})
+    found = compare([folder], {}, True)
+    for run in found.results:
+        if (run["agent"], run["game"]) == (BASE, "Pong"):
+            run["evaluations"] = run["evaluations"][-1:]
+    axes = {ax.get_title(): ax for ax in all_figures(analyse(found, 5))[-1].figure.axes}
+    pong, boxing = axes["Pong"], axes["Boxing"]
+    (alone,), (first, second) = ([line.get_linestyle() for line in ax.get_lines()] for ax in (pong, boxing))
+    assert alone in (first, second) and first != second
+    assert alone == {line.get_color(): line.get_linestyle() for line in boxing.get_lines()}[pong.get_lines()[0].get_color()]
+
+
 def test_other_units_have_no_published_scores(report_of):
     text = text_of(report_of(suite=normalised("random play 0, solved 1")))
     assert "games above 1" in text and "superhuman" not in text and "SPR" not in text and "†" not in text

@@ -9,8 +9,7 @@ import pytest
 import torch as th
 
 from experiments import speed, workload
-from experiments.workload import AGENTS, BEFORE, EQR_AGENTS, OFF, Series, Table, fill, make_agent
-from sb3_eqr import EqRQRDQN
+from experiments.workload import EQR_AGENTS, NETWORKS, OFF, Series, Table, make_agent
 from tests.tools.test_package import ROOT
 
 
@@ -66,18 +65,17 @@ def test_a_table():
 
 def test_options():
     args = speed.parse([])
-    assert args.only == ["updates"] and args.network is None
-    args = speed.parse(["--only", "parts,graph", "--network", "minatar,cartpole", "--before", str(ROOT)])
+    assert args.only == ["updates"] and args.network == list(NETWORKS)
+    args = speed.parse(["--only", "parts", "graph", "--network", "minatar", "cartpole"])
     assert args.only == ["parts", "graph"] and args.network == ["minatar", "cartpole"]
 
 
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ("--only stepz", "--only must be some of updates, graph, parts, got 'stepz'"),
-        ("--network doom", "--network must be some of atari, minatar, cartpole, got 'doom'"),
+        ("--only stepz", "argument --only: invalid choice: 'stepz'"),
+        ("--network doom", "argument --network: invalid choice: 'doom'"),
         ("--rounds 0", "--rounds must be an integer >= 1, got 0"),
-        ("--before nowhere", "--before must be a folder with sb3_eqr in it, got 'nowhere'"),
     ],
 )
 def test_wrong_options(wrong, message, capsys):
@@ -86,26 +84,9 @@ def test_wrong_options(wrong, message, capsys):
     assert message in " ".join(capsys.readouterr().err.split())
 
 
-def test_importing_another_version_together_with_this_one(monkeypatch):
-    """The same version, imported again: its classes are different objects and behave the same."""
-    monkeypatch.setattr(workload, "AGENTS", dict(AGENTS))
-    modules, path = dict(sys.modules), list(sys.path)
-    workload.add_before(str(ROOT))
-    assert sys.path == path and all(sys.modules[name] is module for name, module in modules.items())
-    found, now = workload.AGENTS["EqRQRDQN" + BEFORE], workload.AGENTS["EqRQRDQN"]
-    assert list(now) != list(found) and [one.__name__ for one in now] == [one.__name__ for one in found]
-    assert not issubclass(found[0], EqRQRDQN) and len(workload.AGENTS) == 11
-    models = [make_agent(name, buffer_size=64, batch_size=4, prediction_depth=1) for name in ("EqRQRDQN", "EqRQRDQN" + BEFORE)]
-    for model in models:
-        fill(model.replay_buffer, 40)
-        model.set_random_seed(1)
-        model.train(2, 4)
-    assert all(th.equal(*pair) for pair in zip(*(model.policy.parameters() for model in models), strict=True))
-
-
 @pytest.mark.slow
 def test_script_prints_its_tables(tmp_path):
-    parts = ["--only", "updates", "--network", "minatar", "--before", str(ROOT)]
+    parts = ["--only", "updates", "--network", "minatar"]
     command = [sys.executable, "-m", "experiments.speed", "--threads", "1", "--rounds", "1", *parts]
     done = subprocess.run([*command, "--json", tmp_path / "speed.json"], check=True, capture_output=True, text=True, cwd=ROOT)
     found = json.loads((tmp_path / "speed.json").read_text())
@@ -116,7 +97,7 @@ def test_script_prints_its_tables(tmp_path):
     operations = {row["name"]: row["operations"] for row in tables["updates_minatar"]["rows"]}
     assert (operations["DQN"], operations["QRDQN"]) == (140, 170)
     for name in EQR_AGENTS:
-        assert operations[name] == operations[name + BEFORE] > operations[name + OFF]
+        assert operations[name] > operations[name + OFF]
 
 
 def test_parts():

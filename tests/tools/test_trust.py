@@ -142,7 +142,11 @@ def test_one_file_alone_is_checked(hostile, sb3_eqr, missing, tmp_path):
 
 WRAPPERS = ["sb3_eqr.envs.atari.Atari100kWrapper", "stable_baselines3.common.atari_wrappers.WarpFrame"]
 WRAPPERS += ["sb3_contrib.common.wrappers.TimeFeatureWrapper", "gymnasium.wrappers.FlattenObservation"]
-WRAPPERS += ["rl_zoo3.wrappers.MaskVelocityWrapper", "stable_baselines3.common.vec_env.VecFrameStack"]
+WRAPPERS += [
+    "gymnasium.wrappers.TimeLimit",
+    "rl_zoo3.wrappers.MaskVelocityWrapper",
+    "stable_baselines3.common.vec_env.VecFrameStack",
+]
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)

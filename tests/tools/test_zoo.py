@@ -3,6 +3,7 @@
 import errno
 import importlib.util
 import os
+import pathlib
 import re
 import signal
 import subprocess
@@ -21,10 +22,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_eqr import DISCRETE, EqRQRDQN, EqRRainbow, cli, zoo
+from sb3_eqr.cli import COMMANDS
 from sb3_eqr.configurations import configuration_files
 from sb3_eqr.envs.minatar import ChannelsFirstImage
 from sb3_eqr.trust import read_plain, read_trusted
-from sb3_eqr.zoo.__main__ import COMMANDS, find_hyperparameters, parse
+from sb3_eqr.zoo.__main__ import find_hyperparameters, parse
 from sb3_eqr.zoo.entries import entry_name
 from sb3_eqr.zoo.resuming import ResumableExperiment, RngPreserving, config_of
 from tests.toys import ChainEnv, DictEnv, ImageEnv
@@ -53,7 +55,7 @@ from tests.toys import ChainEnv, DictEnv, ImageEnv
         ("enjoy --algo eqr_qrdqn -f nowhere", "nowhere/eqr_qrdqn/?.* was not found.* train one first"),
         ("enjoy --algo eqr_qrdqn", "was not found.* train one first"),
         ("train --algo eqr_qrdqn --env SlidingBall-v0 --env-kwargs size:20", "SlidingBall-v0: size must be an integer >= 36"),
-        ("train --algo eqr_qrdqn -i nothing.zip", "must be the path of a .zip file.*'nothing.zip'"),
+        ("train --algo eqr_qrdqn -i nothing.zip", "The trained_agent must be a valid path to a .zip file"),
         ("record_video --algo eqr_qrdqn -f nowhere", "was not found.* train one first"),
         ("train --algo eqr_qrdqn -params learning_rate:'1e-3'", "learning_rate must be a number, .*'1e-3', .* write 0.001"),
         ("train --algo eqr_qrdqn -params n_timesteps:'1e5'", "n_timesteps must be a number, .*'1e5', .* write 100000"),
@@ -79,8 +81,6 @@ def test_wrong_use_prints_an_error(sb3_eqr, line, message):
 @pytest.mark.parametrize(
     "package, line, advice",
     [
-        ("wandb", "train --algo eqr_qrdqn --track", "pip install wandb"),
-        ("tensorboard", "train --algo eqr_qrdqn -tb tb", "pip install tensorboard"),
         ("minatar", "train --algo eqr_qrdqn --env MinAtar/Breakout-v1", "pip install minatar"),
         ("ale_py", "train --algo eqr_qrdqn --env PongNoFrameskip-v4", 'pip install ".[atari]" in a clone of the repository'),
     ],
@@ -185,6 +185,7 @@ def test_wrappers_decide_which_entry_is_used(capfd):
     assert entry_name(entries, "SlidingBall-v0", small) == "default-small-image"
     flat = {"env_wrapper": "gymnasium.wrappers.FlattenObservation"}
     assert entry_name(entries, "SlidingBall-v0", flat) == "default"
+    assert entry_name({"default": {}, "default-dict": {}}, "SlidingBall-v0", {}) == "default"
     with pytest.raises(SystemExit):
         entry_name(entries, "SlidingBall-v0", {"env_kwargs": {"size": 20}})
     assert "SlidingBall-v0: size must be an integer >= 36, got 20" in capfd.readouterr().err
@@ -281,6 +282,9 @@ def test_a_resumed_run_is_evaluated_in_its_own_environment(sb3_eqr, tmp_path, mo
     sb3_eqr(f"{line} -n 240 --resume {run}")
     assert made == [{"is_slippery": False}] * 2
     (run / "FrozenLake-v1" / "args.yml").unlink()
+    monkeypatch.chdir(run)
+    with pytest.raises(ValueError, match=r"must have args\.yml beside config\.yml"):
+        config_of(pathlib.Path("."), trust=True)
     with pytest.raises(ValueError, match=r"must have args\.yml beside config\.yml"):
         config_of(run, trust=True)
 
@@ -502,7 +506,7 @@ def test_the_command_without_rl_zoo(monkeypatch):
 def test_the_help_lists_every_command(sb3_eqr):
     """With what it does; an unknown command or option gets the closest one."""
     lines = [line for line in sb3_eqr("--help").out.splitlines() if line.startswith("  ")]
-    assert [line.split()[0] for line in lines[:-2]] == [*COMMANDS, "benchmark", "visualize"]
+    assert [line.split()[0] for line in lines[:-2]] == [*COMMANDS["zoo"], "benchmark", "visualize"]
     assert "got 'tran'. Did you mean 'train'?" in sb3_eqr("tran", code=2).err
     assert "--agets a. Did you mean '--agents'?" in sb3_eqr("benchmark run x --agets a", code=2).err
 
