@@ -44,6 +44,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
     reward_coef: float
     policy_description: dict[str, str]
     frame_stack = 1
+    observations_normalized = False  # by VecNormalize, when the agent was saved with its environment
     reward_mean = 0.0  # which the reward network's targets are standardised by: mean and standard deviation
     reward_scale = 1.0
     _monitor: UpdateMonitor
@@ -197,6 +198,8 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite
+        if self.env is not None:
+            self.observations_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
 
 
 def keep_freed_memory() -> None:

@@ -17,8 +17,8 @@ SENTENCES = {
     "predicts": "The latent model predicts: {errors}{unless}. Only a comparison with runs without EqR shows whether this "
     "raises returns.",
     "does not predict": "The latent model does not predict: {errors}. It predicts if its error is at least {limit:.0%} lower "
-    "than both. Train longer, or raise aet_coef. Where a step moves the state little, no motion is hard to beat. "
-    "The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
+    "than both. Train longer, or, with discrete actions, raise aet_coef. Where a step moves the state little, no motion is "
+    "hard to beat. The verdict does not say whether returns improve; transition.csv shows at which step the prediction fails.",
     "not trained": "The latent model was not trained, so there is no prediction to judge: prediction_depth is 0, or aet_coef, "
     "symmetry_coef and reward_coef all are.",
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "

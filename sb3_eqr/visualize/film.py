@@ -100,10 +100,13 @@ def shoot(model: EqROffPolicy, env: GymEnv | str, n_steps: int, seed: int, deter
     env = latents.as_vec_env(model, env)
     normalize, obs = unwrap_vec_normalize(env), latents.reset(model, env, seed)
     names = action_names(env, model)
+    can_render = env.render_mode == "rgb_array" and "rgb_array" in (env.get_attr("metadata", 0)[0] or {}).get(
+        "render_modes", []
+    )
     rows, start, score = [], 0, 0.0
     for t in range(n_steps):
         seen = latents.each_part(obs, lambda x: x[0])
-        picture = np.asarray(env.get_images()[0], np.uint8) if env.render_mode == "rgb_array" else None
+        picture = np.asarray(env.get_images()[0], np.uint8) if can_render else None
         chosen, _ = model.predict(obs, deterministic=deterministic)
         obs, rewards, dones, _ = env.step(chosen)
         reward = float((rewards if normalize is None else normalize.get_original_reward())[0])

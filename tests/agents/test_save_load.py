@@ -377,6 +377,12 @@ def test_loading_executes_no_code(make, model, tmp_path, monkeypatch):
     assert not pathlib.Path("ran").exists()
 
 
+def test_a_buffer_of_more_environments_is_named(make, model, tmp_path):
+    make(make_vec_env(ChainEnv, 2)).save_replay_buffer(tmp_path / "two")
+    with pytest.raises(ValueError, match="n_envs must be 1, the agent's number of environments, got 2"):
+        model.load_replay_buffer(tmp_path / "two")
+
+
 def test_files_that_are_not_replay_buffers_of_this_package(make, model, tmp_path):
     QRDQN("MlpPolicy", ChainEnv(), buffer_size=100, device="cpu").save_replay_buffer(tmp_path / "stock")
     make(ImageEnv(), "CnnPolicy").save_replay_buffer(tmp_path / "images")

@@ -223,6 +223,9 @@ def test_the_environment_is_rendered_if_possible(make):
     assert rendered[0].shape == (400, 600, 3)
     bars = shoot(model, gym.make("CartPole-v1"), 3, 0, True).pictures
     assert bars[0].shape == (4,) and (bars[0] != bars[2]).any()
+    env = gym.make("CartPole-v1", render_mode="rgb_array")
+    env.unwrapped.metadata = {"render_modes": []}
+    assert shoot(model, env, 3, 0, True).pictures[0].shape == (4,)
 
 
 @EITHER

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from sb3_contrib import QRDQN
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecCheckNan, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecCheckNan, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from sb3_eqr import EqRQRDQN, EqRRainbow, MatrixLieGroup, visualize
 from sb3_eqr.common.saving.plain_data import encode as encode_plain
@@ -330,6 +330,7 @@ def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
     seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
     assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
     assert found.get_attr("render_mode") == [None]
+    loaded.observations_normalized = False
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", env_kwargs={"render_mode": "rgb_array"})))
     assert loading.make_env(loaded, path).get_attr("render_mode") == ["rgb_array"]  # of a file of entries, or after --resume
     (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Dark-v0", env_kwargs=None, gym_packages=[])))
@@ -359,6 +360,19 @@ def test_statistics_of_a_normalised_run_must_be_there(folder):
     model.save(folder.parent / "best_model")
     with pytest.raises(ValueError, match=r"vecnormalize\.pkl must exist, because the agent was trained with normalize: true"):
         loading.make_env(model, folder.parent / "best_model.zip")
+
+
+def test_statistics_of_an_agent_saved_from_python_must_be_there(tmp_path):
+    env = VecNormalize(make_vec_env("CartPole-v1", seed=0))
+    model = make_model(env=env)
+    model.save(tmp_path / "model")
+    model = loading.load_model(tmp_path / "model.zip")
+    model.save(tmp_path / "model")  # without an environment
+    model = loading.load_model(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=r"vecnormalize\.pkl must exist, because the agent was trained with VecNormalize"):
+        loading.make_env(model, tmp_path / "model.zip", "CartPole-v1")
+    env.save(tmp_path / "vecnormalize.pkl")
+    assert unwrap_vec_normalize(loading.make_env(model, tmp_path / "model.zip", "CartPole-v1")) is not None
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,8 @@ def read_buffer(file: BinaryIO, like: Any, trust: bool = False) -> tuple[Any, di
                 raise ValueError(
                     f"it was saved by another version, attributes differ: {sorted(state.keys() ^ expected.keys())}"
                 )
+            if (n_envs := decode(state["n_envs"])) != like.n_envs:
+                raise ValueError(f"n_envs must be {like.n_envs}, the agent's number of environments, got {n_envs}")
             n = decode(state["buffer_size"])
             check("buffer_size", n, integer(1))
             resized = {like.buffer_size: n}

@@ -295,7 +295,7 @@ class SafeFiles(OffPolicyAlgorithm):
             except (ValueError, EOFError, pickle.UnpicklingError, AssertionError) as error:
                 raise ValueError(
                     f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
-                    f"got something else ({error}). Load an earlier one."
+                    f"got something else ({error}). Load another one."
                 ) from error
 
 
