@@ -54,7 +54,7 @@ def signal(model: EqRRainbow, observations: np.ndarray) -> dict[str, float]:
 def gradients(model: EqRRainbow, n_updates: int) -> dict[str, float]:
     """Train on the replay buffer; medians of the gradients' norms at the state, and of their ratio before it is limited."""
     model.train(n_updates, model.batch_size)
-    norms = [[update[f"{which}_state_gradient"] for which in ("td", "aux")] for update in model._monitor.collect()]
+    norms = [[update[f"{which}_state_gradient"] for which in ("td", "aux")] for update in model._monitor.collect(0)]
     td, auxiliary = np.array(norms).T
     return {name: float(np.median(x)) for name, x in (("td", td), ("auxiliary", auxiliary), ("ratio", auxiliary / td))}
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer
+from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer, plain
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.objective import LatentObjective
 from sb3_eqr.common.off_policy import EqROffPolicy, keep_freed_memory
@@ -60,13 +61,13 @@ class EqRActorCritic(EqROffPolicy):
         validation.check_device(kwargs["device"])
         validation.warn_of_memory_option(kwargs.pop("optimize_memory_usage"))
         policy_kwargs = dict(policy_kwargs or {})  # a copy, because SB3 changes it
+        kwargs = {name: plain(value) for name, value in kwargs.items()}
         super().__init__(policy, env, policy_kwargs=policy_kwargs, **kwargs, _init_setup_model=False)  # type: ignore[call-arg]
         self.prediction_depth = prediction_depth
         self.aet_coef = aet_coef
         self.symmetry_coef = symmetry_coef
         self.reward_coef = reward_coef
         self.latent_batch_size = latent_batch_size
-        self.policy_description: dict[str, str] = {}  # saved with the model
         if _init_setup_model:
             self._setup_model()
 
@@ -84,7 +85,7 @@ class EqRActorCritic(EqROffPolicy):
         return result
 
     def _check_losses(self) -> None:
-        validation.check_losses(1.0, self.depth, self.latent_batch_size or self.batch_size, self.gamma, None)
+        validation.check_losses(1.0, self.depth, self.latent_batch_size or self.batch_size, False, self.gamma, None)
         self.policy.check_losses(self.depth, self.symmetry_coef)
 
     def _setup_model(self) -> None:
@@ -134,8 +135,8 @@ class EqRActorCritic(EqROffPolicy):
             finally:
                 self.replay_buffer = buffer
         recorded = self.logger.name_to_value
-        with self._step_named():
-            self._monitor.check_losses({name: recorded[name] for name in LOSSES if name in recorded}, self._n_updates)
+        losses = {name: recorded[name] for name in LOSSES if name in recorded}
+        self._monitor.check_losses(losses, self._n_updates, self.num_timesteps)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
         """As SB3's ``collect_rollouts``; raises FloatingPointError if an update made the networks infinite or NaN."""
@@ -155,7 +156,9 @@ class EqRActorCritic(EqROffPolicy):
         """One update of encoder and latent model, and of their moving averages."""
         policy, objective = self.policy, self.objective
         if policy.options.reward_loss == "mse":  # the other loss needs their signs
-            samples = self._standardized(samples)
+            rewards: Any = samples.rollout_rewards
+            scaled = ((rewards - self.reward_mean) / self.reward_scale).clamp(-MAX_REWARD, MAX_REWARD)
+            samples = samples._replace(rollout_rewards=scaled)
         observations = objective.augment(samples.observations)
         features = policy.encoder(observations)
         names = [name for name, coef in self.loss_coefs.items() if coef > 0]
@@ -167,12 +170,6 @@ class EqRActorCritic(EqROffPolicy):
         policy.target_copy.update(policy.options.latent_tau)  # type: ignore[arg-type]
         policy.reader.forget()
         self._monitor.add({f"{name}_loss": mean.detach() for name, mean in means.items()})
-
-    def _standardized(self, samples: SequenceReplayBufferSamples) -> SequenceReplayBufferSamples:
-        """The windows with rewards standardised, and clipped."""
-        assert samples.rollout_rewards is not None
-        rewards = (samples.rollout_rewards - self.reward_mean) / self.reward_scale
-        return samples._replace(rollout_rewards=rewards.clamp(-MAX_REWARD, MAX_REWARD))
 
     def _find_reward_scale(self, buffer: SequenceReplayBuffer, gradient_steps: int) -> None:
         """Estimate mean and standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
@@ -192,21 +189,21 @@ def moments(rewards: np.ndarray) -> tuple[float, float]:
     return mean, spread if spread > MIN_SPREAD * np.abs(rewards).max() else 1.0
 
 
+@dataclass(eq=False)
 class BeforeSamples:
     """
     A replay buffer for one round of updates; each call of ``sample`` first passes ``n_windows`` windows of its own to a
     function, then draws transitions without rollouts.
     """
 
-    def __init__(self, buffer: SequenceReplayBuffer, function: Callable[[SequenceReplayBufferSamples], None], n_windows: int):
-        self._buffer = buffer
-        self._function = function
-        self._n_windows = n_windows
+    buffer: SequenceReplayBuffer
+    function: Callable[[SequenceReplayBufferSamples], None]
+    n_windows: int
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceReplayBufferSamples:
         """As that of the buffer."""
-        buffer = self._buffer
-        self._function(buffer.sample(self._n_windows, env))
+        buffer = self.buffer
+        self.function(buffer.sample(self.n_windows, env))
         depth, buffer.prediction_depth = buffer.prediction_depth, 0
         try:
             return buffer.sample(batch_size, env)

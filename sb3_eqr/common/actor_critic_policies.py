@@ -41,7 +41,6 @@ from sb3_eqr.common.networks.encoders import (
     find_trunk,
     is_flat,
     make_trunk,
-    with_image_scale,
 )
 from sb3_eqr.common.networks.inputs import Augmentation, keys_of
 from sb3_eqr.common.networks.optimizers import can_fuse, find_optimizer
@@ -283,7 +282,7 @@ class EqRActorCriticPolicy(BasePolicy):
             action_space,
             lr_schedule,  # type: ignore[arg-type]
             features_extractor_class=find_trunk(features_extractor_class),
-            features_extractor_kwargs=features_extractor_kwargs,
+            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # a copy, because SB3 changes it
             **kwargs,
         )
 
@@ -319,9 +318,8 @@ class EqRActorCriticPolicy(BasePolicy):
 
     def _make_latent_model(self) -> None:
         options = self.options
-        kind = self.features_extractor_class
-        trunk_kwargs = with_image_scale(kind, self.features_extractor_kwargs, self.normalize_images)
-        self.encoder = make_trunk(kind, self.observation_space, trunk_kwargs, self.layer_norm, False)
+        kind, kwargs = self.features_extractor_class, self.features_extractor_kwargs
+        self.encoder = make_trunk(kind, self.observation_space, kwargs, self.layer_norm, False, self.normalize_images)
         names = ("group", "n_blocks", "parameterization", "whiten")
         layer = GroupLayer(self.encoder.features_dim, **{name: getattr(options, name) for name in names})
         self.latent_model = LatentModel(layer, layer.group, layer.n_blocks, get_action_dim(self.action_space), options)

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFrequen
 from stable_baselines3.common.utils import LinearSchedule, get_device
 
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments
+from sb3_eqr.common.checks.arguments import ALGORITHM, check_arguments, plain
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.cuda_graph import CapturedUpdate
 from sb3_eqr.common.networks.optimizers import clip_grad_norm, set_adam_defaults
@@ -157,7 +157,7 @@ class EqRAlgorithm(EqROffPolicy):
         super().__init__(  # type: ignore[call-arg]
             policy,
             env,
-            learning_rate=learning_rate,
+            learning_rate=plain(learning_rate),
             buffer_size=buffer_size,
             learning_starts=learning_starts,  # type: ignore[arg-type]
             batch_size=batch_size,
@@ -173,11 +173,11 @@ class EqRAlgorithm(EqROffPolicy):
             exploration_initial_eps=exploration_initial_eps,
             exploration_final_eps=exploration_final_eps,
             max_grad_norm=max_grad_norm,
-            stats_window_size=stats_window_size,
+            stats_window_size=plain(stats_window_size),
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
             verbose=verbose,
-            seed=seed,
+            seed=plain(seed),
             device=device,
             _init_setup_model=False,
         )
@@ -193,7 +193,6 @@ class EqRAlgorithm(EqROffPolicy):
         self.intensity_scale = intensity_scale
         self.resets = resets
         self.cuda_graph = cuda_graph
-        self.policy_description: dict[str, str] = {}  # saved with the model, see EqRPolicy.description
         self.representation_frozen = False  # set by load_representation; saved with the model
         self._resets = Resets(ResetSchedule.of(resets))  # saved with the model
         if _init_setup_model:
@@ -202,7 +201,7 @@ class EqRAlgorithm(EqROffPolicy):
     def _setup_model(self) -> None:
         """As SB3's, but supports n-step replay of dicts and a target update per gradient step."""
         self._check_arguments()
-        self._check_losses()
+        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.env is not None:
@@ -210,7 +209,7 @@ class EqRAlgorithm(EqROffPolicy):
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         self.policy = self._make_policy()
-        self._check_losses_of_policy()
+        self._check_losses()
         saved, self.policy_description = self.policy_description, self.policy.description
         validation.check_same_parameters(self.policy_description, saved)
         self._convert_train_freq()
@@ -248,8 +247,15 @@ class EqRAlgorithm(EqROffPolicy):
         return {**options, "target_is_copied": self.tau == 1 and self.target_update_interval is None}
 
     def _check_losses(self) -> None:
-        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
-        validation.check_losses(self.td_coef, self.depth, self.batch_size, self.gamma, self.resets.initial_gamma)
+        whiten, schedule = self.policy.options.whiten, self._resets.schedule
+        validation.check_losses(self.td_coef, self.depth, self.batch_size, whiten, self.gamma, schedule.initial_gamma)
+        explores = self.policy.noisy or schedule.interval is not None  # resets also cause exploration
+        if self.exploration_final_eps == 0 and not explores:
+            warnings.warn(
+                "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
+                "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
+            )
+        self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
         if self.representation_frozen:
             self._check_losses_of_frozen()
 
@@ -259,16 +265,6 @@ class EqRAlgorithm(EqROffPolicy):
                 "td_coef must be > 0 with a frozen representation and no reward loss, because nothing that uses the "
                 "representation would be trained, got 0. Pass td_coef > 0, or freeze=False."
             )
-
-    def _check_losses_of_policy(self) -> None:
-        validation.check_whitening(self.policy.options.whiten, self.batch_size)
-        explores = self.policy.noisy or self._resets.schedule.interval is not None  # resets also cause exploration
-        if self.exploration_final_eps == 0 and not explores:
-            warnings.warn(
-                "exploration_final_eps=0 and noisy=False: after the first steps, the agent acts greedily. "
-                "Pass, for example, exploration_final_eps=0.01, or keep noisy=True."
-            )
-        self.policy.check_losses(aet=self.depth > 0 and self.aet_coef > 0, symmetry=self.depth > 0 and self.symmetry_coef > 0)
 
     @property
     def loss_coefs(self) -> dict[str, float]:
@@ -286,8 +282,8 @@ class EqRAlgorithm(EqROffPolicy):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         check_arguments(vars(self), self.rules)  # attributes may have been changed
+        self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         self._check_losses()
-        self._check_losses_of_policy()
         self._make_exploration_schedule()
         if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):
             self._set_up_objective()

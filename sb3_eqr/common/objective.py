@@ -1,6 +1,7 @@
 """The objective of one update (Eq. 21): computes the losses of samples. ``train`` of the agents applies them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch as th
@@ -38,6 +39,7 @@ class LossTerms(NamedTuple):
         return metrics
 
 
+@dataclass(eq=False)
 class LatentObjective:
     """
     The auxiliary losses of windows.
@@ -49,19 +51,11 @@ class LatentObjective:
     :param target_dtype: in which encoders compute where no gradient flows
     """
 
-    def __init__(
-        self,
-        policy: EqRPolicy | EqRActorCriticPolicy,
-        encoder: nn.Module,
-        latent_encoder: nn.Module,
-        augment: Augmentation,
-        target_dtype: th.dtype = th.float32,
-    ):
-        self.policy = policy
-        self.encoder = encoder
-        self.latent_encoder = latent_encoder
-        self.augment = augment
-        self.target_dtype = target_dtype
+    policy: EqRPolicy | EqRActorCriticPolicy
+    encoder: nn.Module
+    latent_encoder: nn.Module
+    augment: Augmentation
+    target_dtype: th.dtype = th.float32
 
     def latent_losses(
         self, names: list[str], samples: SequenceReplayBufferSamples, observations: PyTorchObs, features: th.Tensor

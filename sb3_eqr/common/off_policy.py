@@ -3,8 +3,7 @@
 import copy
 import inspect
 import io
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -42,9 +41,8 @@ class EqROffPolicy(FiniteData, SafeFiles):
     aet_coef: float
     symmetry_coef: float
     reward_coef: float
-    policy_description: dict[str, str]
+    policy_description: dict[str, str] = {}  # saved with the model, see EqRPolicy.description
     frame_stack = 1
-    observations_normalized = False  # by VecNormalize, when the agent was saved with its environment
     reward_mean = 0.0  # which the reward network's targets are standardised by: mean and standard deviation
     reward_scale = 1.0
     _monitor: UpdateMonitor
@@ -122,20 +120,11 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _log_last_round(self, check_model: bool = False) -> None:
         """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
-        with self._step_named():
-            for update in self._monitor.collect():  # each, because rounds may differ in their number of updates
-                for name, value in update.items():
-                    self.logger.record_mean(f"train/{name}", value)
-            if check_model:
-                self._monitor.check_model(self._n_updates)
-
-    @contextmanager
-    def _step_named(self) -> Iterator[None]:
-        """Add the step to errors of the monitor."""
-        try:
-            yield
-        except FloatingPointError as error:
-            raise FloatingPointError(f"step {self.num_timesteps}, {error}") from None
+        for update in self._monitor.collect(self.num_timesteps):  # each, because rounds may differ in their number of updates
+            for name, value in update.items():
+                self.logger.record_mean(f"train/{name}", value)
+        if check_model:
+            self._monitor.check_model(self._n_updates, self.num_timesteps)
 
     def learn(
         self,
@@ -198,8 +187,6 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite
-        if self.env is not None:
-            self.observations_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
 
 
 def keep_freed_memory() -> None:

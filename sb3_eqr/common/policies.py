@@ -28,7 +28,6 @@ from sb3_eqr.common.networks.encoders import (
     find_trunk,
     make_trunk,
     trunk_of,
-    with_image_scale,
 )
 from sb3_eqr.common.networks.inputs import keys_of
 from sb3_eqr.common.networks.layers import Centering, DistributionalHead
@@ -39,8 +38,6 @@ from sb3_eqr.common.type_aliases import PyTorchObs
 
 Network = TypeVar("Network", bound="EqRNetwork")
 
-DEFAULT_NET_ARCH = (256,)  # appendix B.4
-
 
 class EqRPolicy(BasePolicy):
     """
@@ -48,7 +45,7 @@ class EqRPolicy(BasePolicy):
     It adds the group encoder on top of the policy's features extractor, the latent model and its target copy, and includes
     them in the optimiser and the train mode.
 
-    Subclasses define ``online`` and ``target``. The parameters up to ``optimizer_kwargs`` are those of SB3's policies.
+    Subclasses define ``network_name``. The parameters up to ``optimizer_kwargs`` are those of SB3's policies.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -86,6 +83,7 @@ class EqRPolicy(BasePolicy):
     """
 
     default_trunk_class: ClassVar[type[BaseFeaturesExtractor]] = MlpExtractor
+    network_name: ClassVar[str]  # of the online network; that of its target copy ends in _target
     action_space: spaces.Discrete
     net_arch: list[int]
     activation_fn: type[nn.Module]
@@ -116,7 +114,7 @@ class EqRPolicy(BasePolicy):
         bfloat16_targets: bool = False,
         **kwargs: Any,
     ):
-        check_arguments(locals(), POLICY)
+        check_arguments({**kwargs, **locals()}, POLICY)
         options = {found.name: kwargs.pop(found.name) for found in fields(LatentOptions) if found.name in kwargs}
         check_policy_kwargs(self, EqRPolicy, kwargs)
         self.options = LatentOptions(**options)
@@ -138,10 +136,10 @@ class EqRPolicy(BasePolicy):
             observation_space,
             action_space,
             lr_schedule,  # type: ignore[arg-type]
-            net_arch=list(DEFAULT_NET_ARCH) if net_arch is None else net_arch,
+            net_arch=[256] if net_arch is None else net_arch,  # appendix B.4
             activation_fn=activation_fn,
             features_extractor_class=find_trunk(features_extractor_class or self.default_trunk_class),
-            features_extractor_kwargs=features_extractor_kwargs,
+            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # a copy, because SB3 changes it
             normalize_images=normalize_images,
             optimizer_class=find_optimizer(optimizer_class),
             optimizer_kwargs=optimizer_kwargs,
@@ -151,12 +149,12 @@ class EqRPolicy(BasePolicy):
     @property
     def online(self) -> EqRNetwork:
         """The network that is trained, and that acts unless ``act_with_target``."""
-        raise AttributeError(f"{type(self).__name__} must define `online`")
+        return getattr(self, self.network_name)
 
     @property
     def target(self) -> EqRNetwork:
         """The target copy of the online network."""
-        raise AttributeError(f"{type(self).__name__} must define `target`")
+        return getattr(self, f"{self.network_name}_target")
 
     @property
     def encoder(self) -> BaseFeaturesExtractor:
@@ -176,9 +174,9 @@ class EqRPolicy(BasePolicy):
             raise ValueError(
                 'features_extractor_class must be a trunk if head_input="trunk", got a group encoder. Pass head_input="state".'
             )
-        kwargs = with_image_scale(kind, self.features_extractor_kwargs, self.normalize_images)
+        kwargs = self.features_extractor_kwargs
         if not has_group or self.head_input == "trunk":
-            return make_trunk(kind, space, kwargs, self.layer_norm, self.center)
+            return make_trunk(kind, space, kwargs, self.layer_norm, self.center, self.normalize_images)
         group_kwargs = {**self._group_kwargs, "layer_norm": self.layer_norm, "center": self.center}
         group_kwargs["normalized_image"] = not self.normalize_images
         if is_encoder:
@@ -192,10 +190,8 @@ class EqRPolicy(BasePolicy):
     @property
     def group_layer(self) -> GroupLayer | None:
         """The layer that maps features to group elements, in the encoder or the latent model; ``None`` without a group."""
-        for owner, name in ((self.online.features_extractor, "group_layer"), (self.latent_model, "embedding")):
-            if isinstance(found := getattr(owner, name, None), GroupLayer):
-                return found
-        return None
+        found = getattr(self.encoder, "group_layer", self.latent_model.embedding)
+        return found if isinstance(found, GroupLayer) else None
 
     def _make_network(self, network_class: type[Network], n_atoms: int, **kwargs: Any) -> Network:
         encoder, n_actions = self.make_features_extractor(), int(self.action_space.n)
@@ -341,7 +337,8 @@ class EqRPolicy(BasePolicy):
         self._frozen = modules
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = [name for name in inspect.signature(EqRPolicy.__init__).parameters if name in vars(self)]
+        taken = [inspect.signature(kind.__init__).parameters for kind in (EqRPolicy, type(self))]  # type: ignore[misc]
+        own = [name for parameters in taken for name in parameters if name in vars(self)]
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in own}, **vars(self.options)}
 
 

@@ -1,6 +1,6 @@
 """Resets against the loss of plasticity, and annealing of n and γ after each reset (SR-SPR, BBF)."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sb3_eqr.common.checks.arguments import NONE, SHARE, check_fields, integer, option
@@ -49,16 +49,16 @@ class ResetSchedule:
             return given
         if given is not None and not isinstance(given, dict):
             raise TypeError(f"resets must be a ResetSchedule, a dict of its fields or None, got {given!r}.")
-        check_names("resets", given or {}, [field.name for field in fields(cls)])
+        check_names("resets", given or {}, [found.name for found in fields(cls)])
         return cls(**(given or {}))
 
 
+@dataclass
 class Resets:
     """The resets of one agent so far, and the current n and γ."""
 
-    def __init__(self, schedule: ResetSchedule):
-        self.schedule = schedule
-        self.done: list[int] = []  # number of updates before each reset
+    schedule: ResetSchedule
+    done: list[int] = field(default_factory=list)  # number of updates before each reset
 
     def updates_since(self, n_updates: int) -> int:
         """Number of updates since the last reset, or since the start."""

@@ -1,7 +1,4 @@
-from typing import ClassVar
-
 from sb3_contrib.qrdqn import QRDQN
-from stable_baselines3.common.policies import BasePolicy
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
 from sb3_eqr.eqr_qrdqn.policies import CnnPolicy, EqRQRDQNPolicy, EqRQuantileNetwork, MlpPolicy, MultiInputPolicy
@@ -21,11 +18,7 @@ class EqRQRDQN(EqRAlgorithm, QRDQN):
     :class:`~sb3_eqr.eqr_qrdqn.policies.EqRQRDQNPolicy`.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
     policy: EqRQRDQNPolicy  # type: ignore[assignment]
     quantile_net: EqRQuantileNetwork
     quantile_net_target: EqRQuantileNetwork

@@ -8,7 +8,6 @@ from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_eqr.common.checks.arguments import POLICY, check_arguments
 from sb3_eqr.common.losses import quantile_huber_loss
 from sb3_eqr.common.networks.encoders import ConvExtractor, DictExtractor
 from sb3_eqr.common.networks.q_networks import EqRNetwork
@@ -50,6 +49,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
     :raises ValueError: if an argument is out of range
     """
 
+    network_name = "quantile_net"
     quantile_net: EqRQuantileNetwork
     quantile_net_target: EqRQuantileNetwork
 
@@ -61,16 +61,7 @@ class EqRQRDQNPolicy(EqRPolicy, QRDQNPolicy):
         n_quantiles: int = 51,
         **kwargs: Any,
     ):
-        check_arguments({"n_quantiles": n_quantiles}, POLICY)
         super().__init__(observation_space, action_space, lr_schedule, n_quantiles=n_quantiles, **kwargs)
-
-    @property
-    def online(self) -> EqRQuantileNetwork:
-        return self.quantile_net
-
-    @property
-    def target(self) -> EqRQuantileNetwork:
-        return self.quantile_net_target
 
     def make_quantile_net(self) -> EqRQuantileNetwork:
         return self._make_network(EqRQuantileNetwork, self.n_quantiles)

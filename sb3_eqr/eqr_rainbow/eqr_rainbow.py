@@ -1,10 +1,9 @@
 import warnings
 from itertools import accumulate
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.dqn import DQN
 
 from sb3_eqr.common.eqr_algorithm import EqRAlgorithm
@@ -28,11 +27,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     is for rewards clipped to [-1, 1]; the agent warns if a return lies outside the support.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
     policy: EqRRainbowPolicy  # type: ignore[assignment]
     q_net: EqRCategoricalNetwork
     q_net_target: EqRCategoricalNetwork

@@ -71,6 +71,7 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
     :raises ValueError: if an argument is out of range
     """
 
+    network_name = "q_net"
     q_net: EqRCategoricalNetwork
     q_net_target: EqRCategoricalNetwork
 
@@ -95,14 +96,6 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     @property
-    def online(self) -> EqRCategoricalNetwork:
-        return self.q_net
-
-    @property
-    def target(self) -> EqRCategoricalNetwork:
-        return self.q_net_target
-
-    @property
     def description(self) -> dict[str, str]:
         return {**super().description, "support": f"[{float(self.v_min)}, {float(self.v_max)}]"}
 
@@ -113,11 +106,6 @@ class EqRRainbowPolicy(EqRPolicy, DQNPolicy):
             scale = self.spread_init * (self.v_max - self.v_min)
             network.head.shift(-((network.support - centre) / scale).square().log1p())  # Cauchy, up to a constant
         return network
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        support = {"n_atoms": self.n_atoms, "v_min": self.v_min, "v_max": self.v_max}
-        return {**data, **support, "spread_init": self.spread_init}
 
 
 MlpPolicy = EqRRainbowPolicy

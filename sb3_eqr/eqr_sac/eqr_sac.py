@@ -1,10 +1,9 @@
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_eqr.common.actor_critic import EqRActorCritic
@@ -23,11 +22,7 @@ class EqRSAC(EqRActorCritic, SAC):
     critics the predicted next one: see :class:`~sb3_eqr.common.actor_critic_policies.EqRActorCriticPolicy`.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
     policy: EqRSACPolicy  # type: ignore[assignment]
 
     @answers_misspelt(policy_kwargs=EqRSACPolicy, replay_buffer_kwargs=SequenceReplayBuffer)

@@ -1,10 +1,9 @@
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from sb3_contrib import TQC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_eqr.common.actor_critic import EqRActorCritic
@@ -22,11 +21,7 @@ class EqRTQC(EqRActorCritic, TQC):
     As :class:`~sb3_eqr.EqRSAC`, with TQC in place of SAC.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
     policy: EqRTQCPolicy  # type: ignore[assignment]
 
     @answers_misspelt(policy_kwargs=EqRTQCPolicy, replay_buffer_kwargs=SequenceReplayBuffer)

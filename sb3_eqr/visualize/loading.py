@@ -103,7 +103,7 @@ def make_env(
         env = VecNormalize.load(str(statistics), env)
     if (normalize := unwrap_vec_normalize(env)) is not None:
         normalize.training = False
-    elif model.observations_normalized:
+    elif model.trained_normalized:
         raise ValueError(
             f"{statistics} must exist, because the agent was trained with VecNormalize, got none. "
             "Write it with the save method of that VecNormalize."

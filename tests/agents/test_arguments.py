@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, PrioritizedSequenceReplayBuffer
+from sb3_eqr import EqRQRDQN, EqRRainbow, EqRSAC, PrioritizedSequenceReplayBuffer
 from sb3_eqr.common.checks.arguments import ALGORITHM, BUFFER, POLICY, a_list, integer, number, one_of, rules_of
 from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.policies import EqRPolicy
@@ -92,6 +92,13 @@ def test_actions_may_have_any_integer_type(make):
     assert model._n_updates > 0 and samples.actions.dtype == samples.rollout_actions.dtype == th.int64
 
 
+@pytest.mark.parametrize("kind", [EqRQRDQN, EqRSAC])
+def test_numbers_of_numpy_are_numbers(kind):
+    env = "CartPole-v1" if kind is EqRQRDQN else "Pendulum-v1"
+    model = kind("MlpPolicy", env, seed=np.int64(3), learning_rate=np.float32(0.5), stats_window_size=np.int64(5))
+    assert (model.seed, model.learning_rate, model._stats_window_size) == (3, 0.5, 5)
+
+
 def test_combinations_of_attributes_set_later_are_checked_when_learning_starts():
     model = EqRRainbow("MlpPolicy", ChainEnv(), buffer_size=200, learning_starts=10)
     model.td_coef, model.prediction_depth = 0.0, 0
@@ -102,7 +109,7 @@ def test_combinations_of_attributes_set_later_are_checked_when_learning_starts()
     model.symmetry_coef = 1.0
     with pytest.raises(ValueError, match="group must have inverses for the GET loss"):
         model.learn(20)
-    with pytest.raises(ValueError, match="batch_size must be an integer >= 2 for whiten=True, got 1"):
+    with pytest.raises(ValueError, match="and for whiten=True, got 1"):
         EqRRainbow("MlpPolicy", ChainEnv(), batch_size=1, prediction_depth=0, policy_kwargs={"whiten": True})
 
 

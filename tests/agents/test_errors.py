@@ -77,6 +77,7 @@ OUTSIDE = r"Use VecNormalize\(VecTransposeImage\(env\), norm_obs=False\)"
         (lambda: 3, {}, r"env must be an environment or a VecEnv, got .*make_vec_env"),
         (lambda: SampledEnv(spaces.Discrete(5, start=1)), {}, "observation_space must start at 0"),
         (lambda: SampledEnv(spaces.MultiDiscrete([5, 2], start=[0, 1])), {}, "observation_space must start at 0"),
+        (lambda: SampledEnv(spaces.MultiDiscrete([[5, 2], [2, 2]])), {}, "must be a MultiDiscrete of one dimension"),
         (lambda: SampledEnv(spaces.Box(-1, 1, ())), {}, "observation_space must have at least one axis"),
         (lambda: SampledEnv(spaces.Dict({"a": spaces.Box(-1, 1, ())})), DICT, r"\['a'\] must have at least one axis"),
         (lambda: make_vec_env(ChainEnv, 4), {"buffer_size": 23}, "buffer_size=24"),

@@ -330,7 +330,7 @@ def test_rl_zoos_files_next_to_the_model_are_used(folder, monkeypatch):
     seen = play(loaded, found, 60, depth=2).samples.observations.numpy()
     assert np.abs(seen[:, :2] + 7).max() < 1.001  # a cosine and a sine, normalised once
     assert found.get_attr("render_mode") == [None]
-    loaded.observations_normalized = False
+    loaded.trained_normalized = False
     (folder / "config.yml").write_text(yaml.dump(OrderedDict(policy="MlpPolicy", env_kwargs={"render_mode": "rgb_array"})))
     assert loading.make_env(loaded, path).get_attr("render_mode") == ["rgb_array"]  # of a file of entries, or after --resume
     (folder / "args.yml").write_text(yaml.dump(OrderedDict(env="Dark-v0", env_kwargs=None, gym_packages=[])))
@@ -364,7 +364,7 @@ def test_statistics_of_a_normalised_run_must_be_there(folder):
 
 def test_statistics_of_an_agent_saved_from_python_must_be_there(tmp_path):
     env = VecNormalize(make_vec_env("CartPole-v1", seed=0))
-    model = make_model(env=env)
+    model = make_model(env=env).learn(2)
     model.save(tmp_path / "model")
     model = loading.load_model(tmp_path / "model.zip")
     model.save(tmp_path / "model")  # without an environment

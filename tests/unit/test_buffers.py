@@ -232,8 +232,12 @@ def test_dict_and_discrete_observations():
     buffer = SequenceReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=2, prediction_depth=2)
     space.seed(0)
     made = [{key: np.stack([part.sample(), part.sample()]) for key, part in space.items()} for _ in range(12)]
+    rest = (np.array([0, 1]), np.zeros(2), np.zeros(2, dtype=bool), [{}, {}])
     for now, then in itertools.pairwise(made):
-        buffer.add(now, then, np.array([0, 1]), np.zeros(2), np.zeros(2, dtype=bool), [{}, {}])
+        with pytest.raises(ValueError, match="must have the replay buffer's shape"):  # before anything is stored
+            buffer.add(now, {**then, "vector": np.zeros((2, 1), np.float32)}, *rest)
+        buffer.add(now, then, *rest)
+    assert not buffer.timeouts.any()
     samples = buffer.sample(100)
     for b, index in enumerate(samples.indices):
         t, env = divmod(int(index), 2)

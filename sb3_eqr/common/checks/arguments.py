@@ -186,6 +186,11 @@ def check_fields(options: Any, prefix: str = "") -> None:
     check_arguments(vars(options), rules_of(options), prefix)
 
 
+def plain(value: Any) -> Any:
+    """A number of NumPy as one of Python, which SB3 and PyTorch need in places; anything else unchanged."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def nearest(name: str, legal: Iterable[str], cutoff: float = 0.6) -> str:
     """The end of a message: a question with the closest legal name, or "" if none has at least the similarity ``cutoff``."""
     found = get_close_matches(name, list(legal), n=1, cutoff=cutoff)

@@ -160,7 +160,7 @@ def check_continuous_actions(action_space: spaces.Space) -> None:
 def check_observation_space(observation_space: spaces.Space, name: str = "observation_space") -> None:
     """
     Raise ValueError if it, or a space in a dict, is of a kind without a fixed shape, has no axis, or is Discrete or
-    MultiDiscrete and does not start at 0.
+    MultiDiscrete and does not start at 0, or MultiDiscrete with several axes.
     """
     if isinstance(observation_space, spaces.Dict) and name == "observation_space":
         for key, space in observation_space.spaces.items():
@@ -171,6 +171,8 @@ def check_observation_space(observation_space: spaces.Space, name: str = "observ
             "Wrap the environment, for example with gymnasium.wrappers.FilterObservation to leave keys of a Dict out, with "
             "FlattenObservation, or, for MiniGrid, with minigrid.wrappers.ImgObsWrapper."
         )
+    if isinstance(observation_space, spaces.MultiDiscrete) and observation_space.nvec.ndim > 1:
+        raise ValueError(f"{name} must be a MultiDiscrete of one dimension, got {observation_space}. Flatten it.")
     if isinstance(observation_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(observation_space.start != 0):
         raise ValueError(
             f"{name} must start at 0, because SB3 encodes it as one-hot, got {observation_space}. "
@@ -254,30 +256,22 @@ def check_has_env(algorithm: Any) -> None:
         raise ValueError("env must be an environment or the name of a registered one, got None.")
 
 
-def check_losses(td_coef: float, depth: int, batch_size: int, gamma: float, initial_gamma: float | None) -> None:
-    """Raise ValueError if there is no loss, if a batch has no pairs, or if γ = 1 is to be annealed."""
+def check_losses(td_coef: float, depth: int, batch_size: int, whiten: bool, gamma: float, initial_gamma: float | None) -> None:
+    """Raise ValueError if there is no loss, if a batch has neither pairs nor a covariance, or if γ = 1 is to be annealed."""
     if td_coef == 0 and depth == 0:
         raise ValueError(
             "td_coef must be > 0 if all auxiliary losses are disabled, got 0. "
             "Pass td_coef > 0, or prediction_depth >= 1 and one of aet_coef, symmetry_coef, reward_coef > 0."
         )
-    if depth > 0 and batch_size < 2:
+    if batch_size < 2 and (depth > 0 or whiten):
         raise ValueError(
-            f"batch_size must be an integer >= 2 for the auxiliary losses, which pair samples, got {batch_size}. "
-            "Pass a larger batch_size, or prediction_depth=0."
+            "batch_size must be an integer >= 2 for the auxiliary losses, which pair samples, and for whiten=True, "
+            f"got {batch_size}. Pass a larger batch_size, or prediction_depth=0 and whiten=False."
         )
     if initial_gamma is not None and max(initial_gamma, gamma) == 1:
         raise ValueError(
             f"resets: initial_gamma and gamma must be < 1, because 1 - gamma is annealed geometrically, got "
             f"{initial_gamma} and {gamma}. Pass initial_gamma=None for a constant gamma."
-        )
-
-
-def check_whitening(whiten: bool, batch_size: int) -> None:
-    """Raise ValueError if latent states are to be whitened in batches of one, which have no covariance."""
-    if whiten and batch_size < 2:
-        raise ValueError(
-            f"batch_size must be an integer >= 2 for whiten=True, got {batch_size}. Pass a larger batch_size, or whiten=False."
         )
 
 

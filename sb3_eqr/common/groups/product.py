@@ -20,12 +20,13 @@ class ProductGroup(Group):
     def __init__(self, factors: Sequence[tuple[Group, int]]):
         self.factors = list(factors)
         self.has_inverse = all(group.has_inverse for group, _ in self.factors)
-        self._sizes = [count * prod(group.element_shape) for group, count in self.factors]
         name = " x ".join(f"{group}^{count}" if count > 1 else f"{group}" for group, count in self.factors)
-        super().__init__(name, sum(group.num_params * count for group, count in self.factors), (sum(self._sizes),))
+        sizes = ((count * group.num_params, count * prod(group.element_shape)) for group, count in self.factors)
+        num_params, size = map(sum, zip(*sizes, strict=True))
+        super().__init__(name, num_params, (size,))
 
     def element(self, params: th.Tensor) -> th.Tensor:
-        pairs = zip(self.factors, self._split_params(params), strict=True)
+        pairs = zip(self.factors, self._split(params, [(group.num_params,) for group, _ in self.factors]), strict=True)
         return self._flatten(group.element(p) for (group, _), p in pairs)
 
     def compose(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
@@ -46,21 +47,17 @@ class ProductGroup(Group):
     def for_actions(self) -> Group:
         return ProductGroup([(group.for_actions, count) for group, count in self.factors])
 
-    def _split_params(self, params: th.Tensor) -> list[th.Tensor]:
-        pieces = params.split([group.num_params * count for group, count in self.factors], dim=-1)
-        pairs = zip(self.factors, pieces, strict=True)
-        return [piece.unflatten(-1, (count, group.num_params)) for (group, count), piece in pairs]
+    def _split(self, flat: th.Tensor, shapes: list[tuple[int, ...]]) -> list[th.Tensor]:
+        shapes = [(count, *shape) for (_, count), shape in zip(self.factors, shapes, strict=True)]
+        pieces = flat.split([prod(shape) for shape in shapes], dim=-1)
+        return [piece.unflatten(-1, shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
     def _unflatten(self, element: th.Tensor) -> list[th.Tensor]:
-        pieces = element.split(self._sizes, dim=-1)
-        return [
-            piece.unflatten(-1, (count, *group.element_shape))
-            for (group, count), piece in zip(self.factors, pieces, strict=True)
-        ]
+        return self._split(element, [group.element_shape for group, _ in self.factors])
 
     def _flatten(self, pieces) -> th.Tensor:
-        groups = [group for group, _ in self.factors]
-        return th.cat([piece.flatten(-1 - len(g.element_shape)) for g, piece in zip(groups, pieces, strict=True)], dim=-1)
+        pairs = zip(self.factors, pieces, strict=True)
+        return th.cat([piece.flatten(-1 - len(group.element_shape)) for (group, _), piece in pairs], dim=-1)
 
 
 _FACTOR = re.compile(r"(GL|SE|SO|T|none)(?:\((\d+)\))?(?:\^(\d+))?")
@@ -100,11 +97,5 @@ def _make_factor(part: str, name: str, parameterization: str) -> tuple[Group, in
     kind, n, count = match[1], int(match[2] or NO_GROUP_SIZE), int(match[3]) if match[3] else None
     if n < (2 if kind == "SO" else 1) or count == 0:
         raise ValueError(f"group must be {_LEGAL}, got {name!r}: n is at least 2 for SO, else 1, and the number of blocks 1.")
-    makers: dict[str, Callable[[], Group]] = {
-        "GL": lambda: GL(n),
-        "SE": lambda: SE(n, parameterization),
-        "SO": lambda: SO(n, parameterization),
-        "T": lambda: T(n),
-        "none": lambda: NoGroup(n),
-    }
-    return makers[kind](), count
+    kinds: dict[str, Callable[..., Group]] = {"GL": GL, "SE": SE, "SO": SO, "T": T, "none": NoGroup}
+    return kinds[kind](n, *[parameterization] * (kind in ("SE", "SO"))), count

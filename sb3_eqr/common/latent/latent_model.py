@@ -57,6 +57,7 @@ class LatentModel(nn.Module):
         super().__init__()
         self.options = options
         self.group = group.for_actions
+        self.has_symmetry_loss = group.has_inverse  # which the GET loss needs
         self.n_blocks = n_blocks
         self.action_dim = action_dim
         self.state_dim = n_blocks * prod(group.element_shape)  # D
@@ -95,11 +96,6 @@ class LatentModel(nn.Module):
                 for *_, last in (self.transition, self.action_symmetry):
                     last.weight.mul_(NEAR_IDENTITY)  # type: ignore[operator, union-attr]
                     last.bias.copy_(self.group.identity_params().repeat(self.n_blocks))  # type: ignore[operator, union-attr]
-
-    @property
-    def has_symmetry_loss(self) -> bool:
-        """Whether the group has inverses, which the GET loss needs."""
-        return self.group.has_inverse
 
     def forward(
         self,

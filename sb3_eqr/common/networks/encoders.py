@@ -329,18 +329,13 @@ def is_flat(encoder: nn.Module) -> bool:
     return isinstance(trunk_of(encoder), FLAT)
 
 
-def with_image_scale(trunk_class: type, kwargs: dict[str, Any], normalize_images: bool) -> dict[str, Any]:
-    """The arguments of a trunk, which include whether images are floats, not bytes, as SB3 tells its own extractors."""
-    has_images = issubclass(trunk_class, (ImageExtractor, DictExtractor))
-    return {**kwargs, "normalized_image": True} if has_images and not normalize_images else dict(kwargs)
-
-
 def make_trunk(
     trunk_class: type[BaseFeaturesExtractor],
     observation_space: spaces.Space,
     trunk_kwargs: dict[str, Any],
     layer_norm: bool,
     center: bool,
+    normalize_images: bool = True,
 ) -> BaseFeaturesExtractor:
     """
     :param trunk_class: any features extractor
@@ -348,6 +343,7 @@ def make_trunk(
     :param trunk_kwargs: its other arguments
     :param layer_norm: whether a :class:`NormalizedExtractor` follows
     :param center: as in :class:`NormalizedExtractor`
+    :param normalize_images: whether images are bytes, or already floats
     :return: the trunk
     :raises ValueError: if the trunk is for vectors and the observations are dicts
     """
@@ -361,6 +357,8 @@ def make_trunk(
             "features_extractor_class='flatten' with layer_norm=True: the numbers of each observation are shifted and scaled "
             "to mean 0 and variance 1, which loses information. Pass features_extractor_class='mlp', or layer_norm=False."
         )
+    if not normalize_images and issubclass(trunk_class, (ImageExtractor, DictExtractor)):
+        trunk_kwargs = {**trunk_kwargs, "normalized_image": True}
     trunk = trunk_class(observation_space, **trunk_kwargs)
     return NormalizedExtractor(trunk, center) if layer_norm else trunk
 
@@ -410,10 +408,8 @@ class GroupFeaturesExtractor(BaseFeaturesExtractor):
     ):
         super().__init__(observation_space, 1)  # the size is set below
         found = default_trunk(observation_space, normalized_image) if trunk_class is None else find_trunk(trunk_class)
-        trunk_kwargs = with_image_scale(found, trunk_kwargs or {}, not normalized_image)
-        if features_dim is not None:
-            trunk_kwargs["features_dim"] = features_dim
-        self.trunk = make_trunk(found, observation_space, trunk_kwargs, layer_norm, center)
+        kwargs = {**(trunk_kwargs or {}), **({} if features_dim is None else {"features_dim": features_dim})}
+        self.trunk = make_trunk(found, observation_space, kwargs, layer_norm, center, not normalized_image)
         self.group_layer = GroupLayer(self.trunk.features_dim, group, n_blocks, parameterization, whiten)
         self._features_dim = self.group_layer.state_dim
 

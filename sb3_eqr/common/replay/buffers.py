@@ -152,10 +152,13 @@ class SequenceReplayBuffer(ReplayBuffer):
             is stored in this case
         """
         check_transition(self.action_space, obs, next_obs, action, reward, done)
-        follows = np.ones(self.n_envs, dtype=bool)
+        checked = []
         for key, store in self._stores.items():
             now, then = (part[key] if isinstance(part, dict) else part for part in (obs, next_obs))
-            follows &= store.add(self.pos, self._shaped(now, store), self._shaped(then, store), overwrite=self.full)
+            checked.append((store, self._shaped(now, store), self._shaped(then, store)))
+        follows = np.ones(self.n_envs, dtype=bool)
+        for store, first, second in checked:
+            follows &= store.add(self.pos, first, second, overwrite=self.full)
         # A reset in the middle of an episode (by a second call of learn) counts as a time-out.
         self.timeouts[self.pos - 1, ~follows & ~self._episode_starts] = 1.0
 
@@ -288,8 +291,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         return self._tensor(observations)
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
-        tensor = th.from_numpy(array)  # these arrays are already copies
-        return tensor if self.device.type == "cpu" else tensor.to(self.device)
+        return self.to_torch(array, copy=False)  # these arrays are already copies
 
     def _shaped(self, obs: np.ndarray, store: FrameStore) -> np.ndarray:
         shape = (self.n_envs, *store.obs_shape)

@@ -41,14 +41,15 @@ class FrameStore:
         self.obs_shape = obs_shape
         self._frame_shape = (obs_shape[0] // n_stack, *obs_shape[1:])
         self._ids = np.zeros((n_positions, n_envs, n_stack + 1), dtype=np.int32)
-        # One frame per transition, and one more per episode; the array grows if episodes are short.
-        n_transitions = n_positions * n_envs
-        self._allocate_arrays(1 + n_transitions + n_transitions // 64 + n_envs * (n_stack + 1), np.dtype(dtype))
         self._n_used = 1  # slots below this have been used at some time
         self._n_free = 0  # number of these that are free again, listed in the first entries of _free
+        self._allocate_arrays(np.dtype(dtype))
 
-    def _allocate_arrays(self, capacity: int, dtype: np.dtype) -> None:
+    def _allocate_arrays(self, dtype: np.dtype) -> None:
         self.dtype = dtype
+        n = len(self._ids) * self._ids.shape[1]
+        # One frame per transition, and one more per episode; the array grows if episodes are short.
+        capacity = max(self._n_used, 1 + n + n // 64 + self._ids[0].size)
         self._references = np.zeros(capacity, dtype=np.int32)
         self._free = np.zeros(capacity, dtype=np.int32)
         self._last: np.ndarray | None = None  # the newest next observations, (n_envs, n_stack, *frame_shape)
@@ -180,7 +181,6 @@ class FrameStore:
         state = self.__dict__.copy()
         for name in ("_last", "device", "dtype"):
             del state[name]
-        state["_capacity"] = len(self._frames)
         for name in ("_frames", "_references", "_free"):
             used = state[name][: self._n_used]
             state[name] = used.numpy(force=True) if isinstance(used, th.Tensor) else used
@@ -188,9 +188,8 @@ class FrameStore:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved = {name: state.pop(name) for name in ("_frames", "_references", "_free")}
-        capacity = state.pop("_capacity")
         self.__dict__.update({"device": th.device("cpu"), **state})
-        self._allocate_arrays(capacity, saved["_frames"].dtype)
+        self._allocate_arrays(saved["_frames"].dtype)
         for name, array in saved.items():
             target = getattr(self, name)
             target[: len(array)] = th.from_numpy(array) if isinstance(target, th.Tensor) else array

@@ -111,9 +111,8 @@ def _store(value: Any, like: FrameStore, name: str, archive: zipfile.ZipFile, re
     for slots in (arrays["_ids"], arrays["_free"][:n_free]):
         if slots.size and not 0 <= slots.min() <= slots.max() < n_used:
             raise ValueError(f"{name} must refer to slots below {n_used}")
-    capacity = max(n_used, 1 + n * n_envs + n * n_envs // 64 + n_envs * length)
     store = object.__new__(FrameStore)
-    store.__setstate__({**vars(like), **arrays, "_n_used": n_used, "_n_free": n_free, "_capacity": capacity})
+    store.__setstate__({**vars(like), **arrays, "_n_used": n_used, "_n_free": n_free})
     return store
 
 

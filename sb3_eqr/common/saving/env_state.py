@@ -48,17 +48,10 @@ gymnasium.envs.classic_control.pendulum.PendulumEnv state:array? last_u:array/re
 gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv s:int lastaction:int?
 gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv s:int lastaction:int?
 gymnasium.envs.toy_text.taxi.TaxiEnv s:int lastaction:int? fickle_step:bool
-gymnasium.envs.mujoco.half_cheetah_v5.HalfCheetahEnv data:part
-gymnasium.envs.mujoco.hopper_v5.HopperEnv data:part
-gymnasium.envs.mujoco.walker2d_v5.Walker2dEnv data:part
-gymnasium.envs.mujoco.ant_v5.AntEnv data:part
-gymnasium.envs.mujoco.humanoid_v5.HumanoidEnv data:part
-gymnasium.envs.mujoco.humanoidstandup_v5.HumanoidStandupEnv data:part
-gymnasium.envs.mujoco.swimmer_v5.SwimmerEnv data:part
+gymnasium.envs.mujoco.half_cheetah_v5.HalfCheetahEnv,hopper_v5.HopperEnv,walker2d_v5.Walker2dEnv,ant_v5.AntEnv,\
+humanoid_v5.HumanoidEnv,humanoidstandup_v5.HumanoidStandupEnv,swimmer_v5.SwimmerEnv,pusher_v5.PusherEnv,\
+inverted_pendulum_v5.InvertedPendulumEnv,inverted_double_pendulum_v5.InvertedDoublePendulumEnv data:part
 gymnasium.envs.mujoco.reacher_v5.ReacherEnv data:part goal:array
-gymnasium.envs.mujoco.pusher_v5.PusherEnv data:part
-gymnasium.envs.mujoco.inverted_pendulum_v5.InvertedPendulumEnv data:part
-gymnasium.envs.mujoco.inverted_double_pendulum_v5.InvertedDoublePendulumEnv data:part
 ale_py.env.AtariEnv ale:part
 minatar.gym.BaseEnv game:part
 minatar.environment.Environment random:part env:part last_action:int
@@ -90,9 +83,10 @@ TYPES: dict[str, tuple[type, ...]] = {
     "part": (),
 }
 ATTRIBUTES = {
-    f"{names.rpartition('.')[0]}.{name}": dict(entry.split(":") for entry in entries)
-    for names, *entries in map(str.split, TABLE.replace("\\\n", "").strip().split("\n"))
-    for name in names.rpartition(".")[2].split(",")
+    f"{first.rsplit('.', 1 + name.count('.'))[0]}.{name}": dict(entry.split(":") for entry in entries)
+    for names, *entries in map(str.split, TABLE.strip().split("\n"))
+    for first, *others in [names.split(",")]
+    for name in [first.rpartition(".")[2], *others]
 }
 
 
@@ -202,14 +196,6 @@ def _is_env(part: Any) -> bool:
     return isinstance(part, gym.Env) and not isinstance(part, gym.Wrapper)
 
 
-def _is_emulator(part: Any) -> bool:
-    return type(part).__module__.startswith("ale_py") and type(part).__name__ == "ALEInterface"
-
-
-def _is_simulation(part: Any) -> bool:
-    return type(part).__module__.startswith("mujoco") and type(part).__name__ == "MjData"
-
-
 def _arrays_of(simulation: Any) -> dict[str, np.ndarray]:
     """
     All arrays of a MuJoCo simulation with a constant size, also those that follow from others: an observation may hold what
@@ -226,9 +212,9 @@ def _state_of(part: Any) -> Any:
         return encode(part.bit_generator.state)
     if isinstance(part, np.random.RandomState):
         return encode(part.get_state(legacy=False))
-    if _is_emulator(part):
+    if type(part).__name__ == "ALEInterface":
         return part.cloneSystemState().serialize().hex()
-    if _is_simulation(part):
+    if type(part).__name__ == "MjData":
         return {"time": part.time, **{name: encode(value) for name, value in _arrays_of(part).items()}}
     if isinstance(part, dict):
         return {key: _state_of(item) for key, item in part.items()}
@@ -253,10 +239,12 @@ def _restore(part: Any, state: Any) -> None:
         if not 0 <= found["state"]["pos"] <= 624:  # NumPy does not check it, and reads beyond its array
             raise ValueError(f"pos of a generator must be in 0 to 624, got {found['state']['pos']}.")
         part.set_state(found)
-    elif _is_emulator(part):
+    elif type(part).__name__ == "ALEInterface":
         part.restoreSystemState(type(part.cloneSystemState())(bytes.fromhex(state)))
-    elif _is_simulation(part):
-        _restore_simulation(part, state)
+    elif type(part).__name__ == "MjData":
+        part.time = _checked("MjData.time", state["time"], "real", part.time)
+        for name, array in _arrays_of(part).items():
+            array[...] = _checked(f"MjData.{name}", decode(state[name]), "array", array)
     elif isinstance(part, dict):
         for key in part:
             _restore(part[key], state[key])
@@ -264,12 +252,6 @@ def _restore(part: Any, state: Any) -> None:
         _load_own(part, state)
     else:
         _restore_attributes(part, state, row)
-
-
-def _restore_simulation(part: Any, state: Any) -> None:
-    part.time = _checked("MjData.time", state["time"], "real", part.time)
-    for name, array in _arrays_of(part).items():
-        array[...] = _checked(f"MjData.{name}", decode(state[name]), "array", array)
 
 
 def _load_own(part: Any, state: Any) -> None:

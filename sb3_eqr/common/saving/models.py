@@ -8,7 +8,7 @@ import pickle
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any, Self
 
@@ -137,6 +137,9 @@ def _decoded(path: Any, data: dict[str, Any], trust: bool) -> dict[str, Any]:
 class SafeFiles(OffPolicyAlgorithm):
     """SB3's ``save``, ``load``, ``save_replay_buffer`` and ``load_replay_buffer`` with atomic writes; pickling and copying."""
 
+    _make_replay_buffer: Callable[[], ReplayBuffer]  # an empty one
+    _before_saving: Callable[[], None]  # if it raises an exception, the old file is kept
+
     def __getstate__(self) -> dict[str, Any]:
         """For ``pickle`` and ``copy``: replace the logger, which holds open files, by one without output until ``learn``."""
         return {**self.__dict__, "_logger": Logger(None, []), "_custom_logger": False}
@@ -159,13 +162,6 @@ class SafeFiles(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # created by _setup_model
-
-    def _make_replay_buffer(self) -> ReplayBuffer:
-        """Create an empty replay buffer from the agent's arguments."""
-        raise NotImplementedError
-
-    def _before_saving(self) -> None:
-        """Called before a model is written; if it raises an exception, the old file is kept."""
 
     @classmethod
     def load(
