@@ -65,6 +65,14 @@ COMPARED: list[Arguments] = [
         (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("eqr_sac", "sac"), *EARLY)
         for task in ("HalfCheetah", "Ant", "Walker2d", "Hopper", "Humanoid")
     ),
+    (
+        "Pendulum from images, EqRSAC",
+        ["continuous_early.xz"],
+        ["PixelPendulum-v0"],
+        ("eqr_sac", "sac"),
+        EARLY[0],
+        "continuous.md#from-images",
+    ),
     ("HalfCheetah, EqRTQC", ["continuous_early.xz"], ["HalfCheetah-v5"], ("eqr_tqc", "tqc"), *EARLY),
     ("HalfCheetah, noise inputs, EqRSAC", NOISE, ["HalfCheetah-v5+noise"], ("eqr_sac", "sac"), *EARLY),
     ("Torus, 8 distractors, aet_coef=5", *FIRST_PAGE, "worlds.md#a-torus-with-distractors"),
@@ -348,6 +356,9 @@ def forest(found: list[Compared], path: pathlib.Path) -> None:
         axis.set_yticks(range(len(found)), labels, fontsize=8)
         axis.set(ylim=(len(found) - 0.4, -0.6))
         axis.set_xlabel("with EqR minus without,\nin standard deviations over seeds", loc="right")
+        axis.set_xscale("symlog", linthresh=2)
+        axis.set_xticks([-2, 0, 2, 5, 10, 20], ["−2", "0", "2", "5", "10", "20"], minor=False)
+        axis.minorticks_off()
         axis.axvline(0, color=GREY, lw=0.7)
         axis.grid(axis="x")
         lines = {str(line.get_label()): line for line in axis.get_lines() if line.get_label() in VERDICTS}
