@@ -355,9 +355,10 @@ def forest(found: list[Compared], path: pathlib.Path) -> None:
         labels = [f"{one.task} ({one.seeds})" for one in found]
         axis.set_yticks(range(len(found)), labels, fontsize=8)
         axis.set(ylim=(len(found) - 0.4, -0.6))
-        axis.set_xlabel("with EqR minus without,\nin standard deviations over seeds", loc="right")
+        axis.set_xlabel("with EqR minus without,\nin standard deviations over seeds\n(beyond 2: logarithmic)", loc="right")
         axis.set_xscale("symlog", linthresh=2)
-        axis.set_xticks([-2, 0, 2, 5, 10, 20], ["−2", "0", "2", "5", "10", "20"], minor=False)
+        axis.set_xticks([-2, 0, 2, 6, 20], ["−2", "0", "2", "6", "20"])
+        axis.set_xlim(right=1.2 * axis.get_xlim()[1])
         axis.minorticks_off()
         axis.axvline(0, color=GREY, lw=0.7)
         axis.grid(axis="x")
