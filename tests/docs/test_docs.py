@@ -171,6 +171,9 @@ def command_lines(text):
     :return: the words of each line, without comments and environment variables
     """
     for line in text.replace("\\\n", " ").splitlines():
+        line = re.sub(
+            r"\{(\d+)\.\.(\d+)\}", lambda ends: " ".join(map(str, range(int(ends[1]), int(ends[2]) + 1))), line
+        )  # bash
         words = shlex.split(line, comments=True)
         while words and re.match(r"[A-Z_]+=", words[0]):
             del words[0]
