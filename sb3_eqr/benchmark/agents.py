@@ -81,10 +81,8 @@ def _agent_of_file(algo: str, file: pathlib.Path, name: str | None = None) -> Ag
         if name is not None:
             raise ValueError(f"--agents: {file}: {name!r} must be a mapping with base and changes, got {found!r:.60}.")
         return Agent(label, algo, file)
-    start, changes = (
-        OFF if found["base"] is False else str(found["base"]),
-        found.get("changes") or {},
-    )  # YAML reads off as False
+    start = OFF if found["base"] is False else str(found["base"])  # YAML reads off as False
+    changes = found.get("changes") or {}
     if not isinstance(changes, dict):
         raise ValueError(f"--agents: {file}: changes must be a mapping, got {changes!r:.60}.")
     beside, _, of_several = start.partition(":")
