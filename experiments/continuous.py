@@ -28,8 +28,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN, create_mlp
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
@@ -50,7 +50,7 @@ ZOO: dict[str, Any] = {"learning_starts": 10_000, "buffer_size": N_STEPS}  # RL 
 SHORT: dict[str, Any] = {"learning_starts": N_RANDOM_SHORT, "buffer_size": N_SHORT, "learning_rate": 1e-3, "batch_size": 64}
 SHORT_NETWORK = {"net_arch": [128, 128]}
 OTHERS = {
-    **dict.fromkeys(("sac", "sac_layer_norm", "sac_two_updates", "sac_shift"), SAC),
+    **dict.fromkeys(("sac", "sac_layer_norm", "sac_two_updates", "sac_shift", "drq"), SAC),
     **{"tqc": TQC, "crossq": CrossQ, "eqr_tqc": EqRTQC, "none_tqc": EqRTQC},
 }
 
@@ -64,6 +64,34 @@ class ShiftedReplay(ReplayBuffer):
         return batch._replace(**shifted)
 
 
+class DrQEncoder(NatureCNN):
+    """SB3's convolutions, with 50 features after layer norm and tanh, as in DrQ (Kostrikov et al. 2021, appendix B)."""
+
+    def __init__(self, observation_space: gym.spaces.Box):
+        super().__init__(observation_space, features_dim=50)
+        self.linear[1] = nn.Sequential(nn.LayerNorm(50), nn.Tanh())
+
+
+class Detached(BaseFeaturesExtractor):
+    """Features of another extractor, without gradient."""
+
+    def __init__(self, extractor: BaseFeaturesExtractor):
+        super().__init__(extractor._observation_space, extractor.features_dim)
+        self.extractor = extractor
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            return self.extractor(observations)
+
+
+class OneEncoderPolicy(SACPolicy):
+    """SAC's policy with one encoder for actor and critics, which only the critics train, as in DrQ."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)  # the actor's optimiser keeps its first encoder, which no gradient reaches from here on
+        self.actor.features_extractor = Detached(self.critic.features_extractor)
+
+
 def first_version(group: str) -> dict[str, Any]:
     """Arguments of EqRSAC as it was at first: actor and critics also read h(s), and the latent model has larger batches."""
     return {"policy_kwargs": {"group": group, "reads_features": True}, "latent_batch_size": None}
@@ -74,6 +102,7 @@ ARMS: dict[str, dict[str, Any]] = {
     **{name: {} for name in OTHERS},
     "sac_two_updates": {"gradient_steps": 2},
     "sac_shift": {"replay_buffer_class": ShiftedReplay},
+    "drq": {"replay_buffer_class": ShiftedReplay, "policy_kwargs": {"features_extractor_class": DrQEncoder}},
     "eqr_sac": {},
     "no_losses": {"prediction_depth": 0},
     "none": first_version("none(72)"),
@@ -100,6 +129,9 @@ class LayerNormPolicy(SACPolicy):
             critic.q_networks[i] = made
             setattr(critic, f"qf{i}", made)
         return critic
+
+
+POLICIES = {"sac_layer_norm": LayerNormPolicy, "drq": OneEncoderPolicy}
 
 
 class Episodes(BaseCallback):
@@ -155,7 +187,7 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
     kwargs = {**(SHORT_NETWORK if is_short else {}), **given.pop("policy_kwargs", {})}
     shared = {**(SHORT if is_short else ZOO), "seed": seed, "device": "cpu", "policy_kwargs": kwargs}
     policy, env = "CnnPolicy" if task == PIXELS else "MlpPolicy", make_env(task)
-    return OTHERS.get(arm, EqRSAC)(LayerNormPolicy if arm == "sac_layer_norm" else policy, env, **given, **shared)
+    return OTHERS.get(arm, EqRSAC)(POLICIES.get(arm, policy), env, **given, **shared)
 
 
 def train(
