@@ -318,8 +318,7 @@ class EqRAlgorithm(EqROffPolicy):
         assert buffer is not None
         self._start_round(buffer)
         for i in range(gradient_steps):
-            is_reset = self._resets.is_due(self._n_updates, gradient_steps - i + self._updates_left())
-            if is_reset:
+            if self._resets.is_due(self._n_updates, gradient_steps - i + self._updates_left()):
                 self._reset()
             buffer.n_steps, buffer.gamma = self._resets.annealed(self._n_updates, self.n_steps, self.gamma)
             buffer.prediction_depth = self.depth
@@ -327,8 +326,8 @@ class EqRAlgorithm(EqROffPolicy):
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
             priorities, metrics = update(samples)
-            if is_reset and self.target_update_interval is not None:  # until now, its statistics were of the old features
-                self.policy.update_target(1.0)
+            if self.target_update_interval is not None and self._resets.done[-1:] == [self._n_updates]:
+                self.policy.update_target(1.0)  # until now, after a reset, its statistics were of the old features
             self._n_updates += 1
             if priorities is not None:
                 buffer.update_priorities(samples.indices, priorities)

@@ -228,9 +228,13 @@ def test_a_target_that_waits_is_copied_again_once_the_features_are_new(make):
     """One batch after the reset, which is before update 20: until then, its running mean is that of the old features."""
     model = make(ChainEnv(), resets={"interval": 20}, target_update_interval=1_000).learn(50)
     model.learn(18, reset_num_timesteps=False)
+    assert model._resets.done == [20] and counts_of_features(model) == ({1}, {36})
+
+
+def counts_of_features(model):
+    """Numbers of batches in the statistics of the target's features, and of the others."""
     counts = {name: value.item() for name, value in model.policy.state_dict().items() if name.endswith("running_count")}
-    target = {count for name, count in counts.items() if "net_target" in name}
-    assert model._resets.done == [20] and target == {1} and {*counts.values()} - target == {36}
+    return tuple({count for name, count in counts.items() if ("net_target" in name) == is_target} for is_target in (True, False))
 
 
 @EITHER
@@ -275,14 +279,17 @@ def test_episodes_are_counted_without_monitor(make):
 
 
 def test_a_reset_that_waits_for_a_longer_window_is_done_once(make):
-    """A reset after 4 updates raises n from 2 to 60, while the buffer has about 45 transitions."""
-    model = make(ChainEnv(), n_steps=2, resets={"interval": 4, "annealing_steps": 1}).learn(42)
+    """A reset after 4 updates raises n from 2 to 60, while the buffer has about 45 transitions; the target waits, too."""
+    resets = {"interval": 4, "annealing_steps": 1}
+    model = make(ChainEnv(), n_steps=2, resets=resets, target_update_interval=1_000).learn(42)
     assert model._n_updates == 4
     model.resets = replace(model.resets, initial_n_steps=60)
     model.learn(8, reset_num_timesteps=False)
     assert model._n_updates == 4 and model._resets.done == [4]
-    model.learn(30, reset_num_timesteps=False)
-    assert model._n_updates > 4
+    model.resets = replace(model.resets, interval=1_000)
+    model.learn(20, reset_num_timesteps=False)
+    updates = model._n_updates - 4
+    assert updates > 1 and counts_of_features(model) == ({1}, {updates})
 
 
 def test_resets_do_not_change_frozen_parameters():
