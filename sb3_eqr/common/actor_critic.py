@@ -11,15 +11,26 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, check_arguments, integer, plain
+from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, Rule, check_arguments, integer, number, one_of, plain
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.objective import LatentObjective
 from sb3_eqr.common.off_policy import EqROffPolicy, keep_freed_memory
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
+
+def is_entropy_coefficient(value: Any) -> bool:
+    """As SB3's SAC reads it: a number, also as text, or "auto", also with an initial value."""
+    try:
+        return 0 <= float(str(value).removeprefix("auto_")) < np.inf
+    except ValueError:
+        return value == "auto"
+
+
 RULES = {
     **ALGORITHM,
+    "ent_coef": Rule('a number >= 0, "auto", or "auto_" with a number', is_entropy_coefficient),
+    "target_entropy": number() | one_of(["auto"]),
     "learning_starts": integer(0),
     "latent_batch_size": integer(2) | NONE,
     "target_update_interval": integer(1),
@@ -78,7 +89,7 @@ class EqRActorCritic(EqROffPolicy):
             raise ValueError(f"replay_buffer_class must sample uniformly, because {name} computes no priorities.")
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        check_arguments(vars(self), self.rules)  # attributes may have been changed
+        self._check_attributes()
         self._check_losses()
         result = super()._setup_learn(*args, **kwargs)
         validation.warn_of_idle_training(self._total_timesteps, self.learning_starts, self._n_updates, self.replay_buffer)

@@ -82,17 +82,12 @@ class ActorCriticOptions(LatentOptions):
                 'next state itself, or, for SAC itself, prediction_depth=0 and policy_kwargs=dict(head_input="observation").'
             )
         super().__post_init__()
-        if self.n_blocks is not None and isinstance(self.group, str) and "^" in self.group:
+        is_whole = isinstance(self.group, str) and ("^" in self.group or self.group.startswith("none"))
+        if is_whole and self.n_blocks not in (None, 1):
             raise ValueError(
-                f"n_blocks must be None with group={self.group!r}, whose name has the number of blocks, got {self.n_blocks}. "
-                'Pass a group without it, such as group="SE(2)", too, or omit n_blocks.'
+                f"n_blocks must be None or 1 with group={self.group!r}, which is the whole latent state, got {self.n_blocks}. "
+                'Pass a group such as group="SE(2)", too, or omit n_blocks.'
             )
-        if isinstance(self.group, str) and self.group.startswith("none"):
-            if self.n_blocks not in (None, 1):
-                raise ValueError(
-                    f"n_blocks must be None or 1 without a group, got {self.n_blocks}. "
-                    'Pass a group such as group="SE(2)" in its place, or another number of values such as group="none(216)".'
-                )
 
 
 class LatentReader(BaseFeaturesExtractor):

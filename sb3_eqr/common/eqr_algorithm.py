@@ -174,7 +174,7 @@ class EqRAlgorithm(EqROffPolicy):
             exploration_final_eps=exploration_final_eps,
             max_grad_norm=max_grad_norm,
             stats_window_size=plain(stats_window_size),
-            tensorboard_log=tensorboard_log,
+            tensorboard_log=plain(tensorboard_log),
             policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=plain(seed),
@@ -281,7 +281,13 @@ class EqRAlgorithm(EqROffPolicy):
         return self._new_replay_buffer(self.replay_buffer_class or default, longest)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        check_arguments(vars(self), self.rules)  # attributes may have been changed
+        self._check_attributes()
+        is_prioritized = isinstance(self.replay_buffer, PrioritizedSequenceReplayBuffer)
+        if self.replay_buffer_class is None and is_prioritized != self.prioritized_replay:
+            raise ValueError(
+                f"prioritized_replay must be {is_prioritized}, as when the replay buffer was made, got "
+                f"{self.prioritized_replay}. Pass it to the constructor, or to load."
+            )
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         self._check_losses()
         self._make_exploration_schedule()

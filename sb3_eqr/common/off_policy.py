@@ -45,6 +45,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
     frame_stack = 1
     reward_mean = 0.0  # which the reward network's targets are standardised by: mean and standard deviation
     reward_scale = 1.0
+    _dumped_steps = -1  # num_timesteps when the log was last written
     _monitor: UpdateMonitor
 
     @property
@@ -57,6 +58,11 @@ class EqROffPolicy(FiniteData, SafeFiles):
         """The effective M: 0 if all auxiliary losses are disabled."""
         is_used = any(coef for name, coef in self.loss_coefs.items() if name != "td")
         return self.prediction_depth if is_used else 0
+
+    def _check_attributes(self) -> None:
+        """Check attributes, which may have been changed between two calls of ``learn``."""
+        check_arguments(vars(self), self.rules)
+        self._convert_train_freq()
 
     def _convert_train_freq(self) -> None:
         given = self.train_freq
@@ -137,19 +143,20 @@ class EqROffPolicy(FiniteData, SafeFiles):
     ) -> Self:
         """
         As SB3's ``learn``, with the same parameters; ``tb_log_name`` defaults to the name of the class. At its end, it writes
-        the log once more, with the last updates, unless ``log_interval`` is ``None``.
+        the log once more, with the last updates, unless it did at this step or ``log_interval`` is ``None``.
         """
         check("total_timesteps", total_timesteps, number(0))
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
         self._log_last_round(check_model=True)
-        if log_interval is not None:  # SB3 logs only at the end of episodes, so the last updates would be missing
+        if log_interval is not None and self._dumped_steps != self.num_timesteps:  # SB3 logs only at the end of episodes
             self.dump_logs()
         return self
 
     def dump_logs(self) -> None:
         """Write log data; losses are means over all updates since the last call."""
         self._log_last_round()
+        self._dumped_steps = self.num_timesteps
         super().dump_logs()
 
     def set_parameters(
@@ -183,7 +190,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_monitor", "_trained", "objective"]
+        return [*super()._excluded_save_params(), "_monitor", "_trained", "objective", "_dumped_steps"]
 
     def _before_saving(self) -> None:
         self._log_last_round(check_model=True)  # which never writes a model that is not finite

@@ -2,6 +2,7 @@
 
 import inspect
 from datetime import timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,6 +151,18 @@ def test_ranges_by_hand():
 def test_lists_and_numpys_integers_are_frequencies(given, wanted):
     found = EqRQRDQN("MlpPolicy", "CartPole-v1", train_freq=given, gradient_steps=1).train_freq
     assert (found.frequency, found.unit.value) == wanted and type(found.frequency) is int
+
+
+def test_attributes_that_learn_reads_again():
+    """A frequency is converted, a path was, and the replay buffer cannot become one of another kind."""
+    model = EqRQRDQN("MlpPolicy", "CartPole-v1", gradient_steps=1, tensorboard_log=Path("logs"))
+    assert model.tensorboard_log == "logs"
+    model.tensorboard_log, model.train_freq = None, 4
+    model.learn(4)
+    assert (model.train_freq.frequency, model.train_freq.unit.value) == (4, "step")
+    model.prioritized_replay = False
+    with pytest.raises(ValueError, match="prioritized_replay must be True, as when the replay buffer was made, got False"):
+        model.learn(4)
 
 
 def test_rules_by_hand():

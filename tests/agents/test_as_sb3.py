@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import NatureCNN
 from torch.nn import functional as F
@@ -167,3 +168,11 @@ def test_spaces_without_a_shape_are_refused_by_name(space):
     env.observation_space = space
     with pytest.raises(ValueError, match=r"observation_space must be a Box, .* or a Dict of these, got "):
         EqRRainbow("MlpPolicy", env)
+
+
+@EITHER
+def test_a_rollout_that_is_stopped_takes_its_arguments_by_position(make):
+    model = make(ChainEnv())
+    _, callback = model._setup_learn(100, lambda *_: False)
+    assert isinstance(callback, ConvertCallback)
+    assert model.collect_rollouts(model.env, callback, model.train_freq, model.replay_buffer) == (1, 0, False)

@@ -234,7 +234,9 @@ def test_a_target_that_waits_is_copied_again_once_the_features_are_new(make):
 def counts_of_features(model):
     """Numbers of batches in the statistics of the target's features, and of the others."""
     counts = {name: value.item() for name, value in model.policy.state_dict().items() if name.endswith("running_count")}
-    return tuple({count for name, count in counts.items() if ("net_target" in name) == is_target} for is_target in (True, False))
+    return tuple(
+        {count for name, count in counts.items() if ("net_target" in name) == is_target} for is_target in (True, False)
+    )
 
 
 @EITHER

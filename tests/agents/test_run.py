@@ -143,6 +143,19 @@ def test_the_last_table_has_the_updates_after_the_last_episode(make, tmp_path):
     assert np.isfinite(last["train/td_loss"])
 
 
+@EITHER
+def test_no_step_has_two_rows_in_the_log(make, tmp_path):
+    class FiveSteps(ChainEnv):
+        def step(self, action):
+            self.position = 0.0
+            return super().step(1)
+
+    model = make(FiveSteps(5), learning_starts=20)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(30, log_interval=1)  # ends with an episode
+    assert pd.read_csv(tmp_path / "progress.csv")["time/total_timesteps"].tolist() == [5, 10, 15, 20, 25, 30]
+
+
 # ---------------------------------------------------------------------------------------------- observations
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import inspect
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
@@ -118,7 +119,7 @@ ALGORITHM: dict[str, Rule] = {
     "intensity_scale": WEIGHT,
     "cuda_graph": FLAG,
     "stats_window_size": integer(1),
-    "tensorboard_log": TEXT | NONE,
+    "tensorboard_log": TEXT | a(os.PathLike, "a path") | NONE,
     "policy_kwargs": DICTIONARY | NONE,
     "verbose": integer(0, 2) | FLAG,
     "seed": integer(0, 2**32 - 1) | NONE,
@@ -187,7 +188,9 @@ def check_fields(options: Any, prefix: str = "") -> None:
 
 
 def plain(value: Any) -> Any:
-    """A number of NumPy as one of Python, which SB3 and PyTorch need in places; anything else unchanged."""
+    """A number of NumPy as one of Python, and a path as a string, which SB3 and PyTorch need in places; else unchanged."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     return value.item() if isinstance(value, np.generic) else value
 
 

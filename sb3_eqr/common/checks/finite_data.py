@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_eqr.common.checks.validation import environment_errors, find_infinite
 
@@ -30,19 +30,19 @@ class FiniteData(OffPolicyAlgorithm):
         self._stored_steps = self.num_timesteps
         return result
 
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> Any:
         """
         As SB3's ``collect_rollouts``, with two differences: errors state if an environment violates gymnasium's interface, and
         the step that a callback saw when it stopped the training, by its answer or by an exception, is stored as all others.
         """
         with environment_errors(self.num_timesteps):
             try:
-                result = super().collect_rollouts(*args, **kwargs)
+                result = super().collect_rollouts(env, callback, *args, **kwargs)
             except BaseException:  # Ctrl-C, too
-                self._finish_step(kwargs["callback"])
+                self._finish_step(callback)
                 raise
             if not result.continue_training:
-                self._finish_step(kwargs["callback"])
+                self._finish_step(callback)
         return result
 
     def _finish_step(self, callback: BaseCallback) -> None:

@@ -292,7 +292,7 @@ def warn_of_slow_bfloat16(device: th.device) -> None:
 def warn_of_memory_option(optimize_memory_usage: bool) -> None:
     """Warn if it is asked for."""
     if optimize_memory_usage:
-        warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each frame only once.")
+        warnings.warn("optimize_memory_usage=True has no effect: the replay buffer always stores each observation only once.")
 
 
 def warn_of_idle_training(last_step: int, learning_starts: int | None, n_updates: int, buffer: Any) -> None:

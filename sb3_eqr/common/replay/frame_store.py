@@ -90,8 +90,9 @@ class FrameStore:
         if not np.array_equal(_bits(stacks[:, 1:]), _bits(next_stacks[:, :-1])):
             raise ValueError(
                 f"frame_stack={self.n_stack}: each observation must be the previous one with its oldest frame "
-                "dropped and one frame appended along the first axis, got another order. "
-                'Pass replay_buffer_kwargs={"frame_stack": 1} to store observations without splitting them into frames.'
+                "dropped and one frame appended along the first axis, got another order. Step and reset the training "
+                "environment only in learn, and evaluate in another one; if its frames have another order, pass "
+                'replay_buffer_kwargs={"frame_stack": 1} to store observations without splitting them into frames.'
             )
         if overwrite:
             self._release(self._ids[position])
