@@ -381,6 +381,7 @@ def test_beta_and_counters(make, beta, final_beta):
 # ---------------------------------------------------------------------------------------------- learning
 
 
+@pytest.mark.slow
 @EITHER
 def test_identity_environment_is_learned(make):
     env = DummyVecEnv([lambda: IdentityEnv(10)])

@@ -209,6 +209,7 @@ def test_gradients_of_network_and_latent_model_are_clipped_apart(make):
     assert {*model._trained} == {p for part in parts for p in part.parameters()}
 
 
+@pytest.mark.slow
 def test_large_rewards_are_learned():
     """Action 1 has the reward c, the others none; one state, without end. With γ = ½, Q of action 1 is 2c."""
     c = 1e3

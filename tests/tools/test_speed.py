@@ -100,6 +100,7 @@ def test_script_prints_its_tables(tmp_path):
         assert operations[name] > operations[name + OFF]
 
 
+@pytest.mark.slow
 def test_parts():
     """Forward: 64 windows of two passes through 4×256×((2 + 1) · 51) of QRDQN; its parts do not exceed the whole."""
     args = speed.parse(["--network", "cartpole", "--rounds", "1", "--threads", "1"])

@@ -282,6 +282,7 @@ class Pickled(th.nn.ReLU):
     """Not plain data, so a file that names it needs trust."""
 
 
+@pytest.mark.slow
 def test_a_film_is_longer_than_its_predictions(trained, sb3_eqr, tmp_path, monkeypatch):
     lengths = []
     monkeypatch.setattr(visualize, "record", lambda model, env, path, n_steps, depth, **_: lengths.append((n_steps, depth)))

@@ -296,6 +296,7 @@ class Drawing(BaseCallback):
         return np.random.rand() + th.rand(1).item() + self.model.action_space.sample() < 10
 
 
+@pytest.mark.slow
 def test_evaluations_of_a_run_with_checkpoints_do_not_change_it():
     def train(callback):
         model = EqRQRDQN("MlpPolicy", ChainEnv(), learning_starts=20, buffer_size=200, batch_size=8, seed=0)
@@ -477,6 +478,7 @@ def test_environments_can_be_rendered(env_id):
     check_env(env.unwrapped if env_id == "BlindCliffwalk-v0" else env, skip_render_check=True)
 
 
+@pytest.mark.slow
 def test_hyperparameter_search_on_minatar(sb3_eqr, tmp_path):
     """The search keeps the entry's small encoder, because Atari's has filters larger than these images."""
     line = "train --algo eqr_rainbow --env MinAtar/Breakout-v1 -n 30 --seed 1 -params learning_starts:25 buffer_size:100"
