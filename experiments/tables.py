@@ -69,7 +69,7 @@ COMPARED: list[Arguments] = [
         "Pendulum from images, EqRSAC",
         ["continuous_early.xz"],
         ["PixelPendulum-v0"],
-        ("eqr_sac", "drq"),  # SAC with one encoder, too
+        ("eqr_sac", "drq"),  # SAC with DrQ's encoder
         EARLY[0],
         "continuous.md#from-images",
     ),
