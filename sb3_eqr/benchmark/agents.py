@@ -1,6 +1,5 @@
 """Agents of a benchmark by name: an algorithm of RL Zoo and the file of hyperparameters that it uses."""
 
-import inspect
 import pathlib
 import re
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ from rl_zoo3.utils import ALGOS
 
 import sb3_eqr
 from sb3_eqr.benchmark.suites import nearest_name
+from sb3_eqr.common.checks.arguments import parameters_of
 from sb3_eqr.configurations import STOCK, configuration_files, merged
 from sb3_eqr.zoo import AGENTS, register
 from sb3_eqr.zoo.entries import check_entry, find_entry, read_entry, read_yaml
@@ -101,21 +101,12 @@ def defaults(agent: Agent, entry: dict[str, Any]) -> dict[str, Any]:
         where they change between versions, the same entry makes another agent
     """
     algorithm = ALGOS[agent.algo]
-    own = {key: value for key, value in _defaults_of(algorithm).items() if key not in entry and key not in UNRELATED}
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))
-    return {**own, "policy_kwargs": {} if policy is None else _defaults_of(policy)}
-
-
-def _defaults_of(cls: type) -> dict[str, Any]:
-    """Defaults of a constructor and of those of its base classes that it passes ``**kwargs`` to."""
-    found: dict[str, Any] = {}
-    for base in cls.__mro__:
-        init = vars(base).get("__init__")
-        parameters = {} if init is None else inspect.signature(init).parameters
-        found = {name: p.default for name, p in parameters.items() if isinstance(p.default, PLAIN)} | found
-        if parameters and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            break
-    return found
+    own, of_policy = (
+        {name: p.default for name, p in parameters_of(kind).items() if isinstance(p.default, PLAIN)} if kind else {}
+        for kind in (algorithm, policy)
+    )
+    return {**{key: own[key] for key in own if key not in entry and key not in UNRELATED}, "policy_kwargs": of_policy}
 
 
 def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:
@@ -146,7 +137,7 @@ def hyperparameters(agent: Agent, protocol: dict[str, Any], action_space: spaces
         raise ValueError(f"{where}: {agent.algo} does not support {kind} actions. Leave the agent out.")
     if steps % entry.get("n_envs", 1):
         raise ValueError(f"{where}: steps must be a multiple of n_envs = {entry['n_envs']}, got {steps}.")
-    default = inspect.signature(ALGOS[agent.algo]).parameters.get("buffer_size")
+    default = parameters_of(ALGOS[agent.algo]).get("buffer_size")
     if default is not None:
         entry["buffer_size"] = min(entry.get("buffer_size", default.default), max(steps, 1_000))
     return entry

@@ -2,7 +2,6 @@
 
 import importlib
 import importlib.util
-import inspect
 import pathlib
 import runpy
 from typing import Any
@@ -12,11 +11,21 @@ import numpy as np
 import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import ALGOS, get_wrapper_class
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_eqr import DISCRETE
-from sb3_eqr.common.checks.arguments import ALGORITHM, DICTIONARY, FLAG, NONE, TEXT, Rule, integer, nearest, number
+from sb3_eqr.common.checks.arguments import (
+    ALGORITHM,
+    DICTIONARY,
+    FLAG,
+    NONE,
+    TEXT,
+    Rule,
+    integer,
+    nearest,
+    number,
+    parameters_of,
+)
 from sb3_eqr.common.off_policy import EqROffPolicy
 from sb3_eqr.configurations import ZOO_KEYS, configuration_files
 from sb3_eqr.envs.pixels import SMALLEST_PICTURE
@@ -144,11 +153,8 @@ def check_entry(entry: dict[str, Any], algo: str, source: str) -> None:
     """
     algorithm = ALGOS[algo]
     policy = algorithm.policy_aliases.get(entry.get("policy", ""))
-    kinds = (
-        [] if policy is None else [kind for kind in policy.__mro__ if issubclass(kind, BasePolicy) and kind is not BasePolicy]
-    )
-    own = {name for kind in kinds for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
-    legal = ENTRY_KEYS | set(inspect.signature(algorithm).parameters) - FLAGS.keys()
+    own = {} if policy is None else parameters_of(policy)
+    legal = ENTRY_KEYS | parameters_of(algorithm).keys() - FLAGS.keys()
     for key in entry:
         if key in FLAGS:
             fail(f"{source}: {key!r} is not allowed here, because RL Zoo sets it from {FLAGS[key]}.")

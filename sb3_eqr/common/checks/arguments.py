@@ -177,6 +177,19 @@ def with_fields_of(options: type) -> Callable[[Any], Any]:
     return decorate
 
 
+def parameters_of(cls: type) -> dict[str, inspect.Parameter]:
+    """Parameters of a constructor, and of those of base classes that it passes ``**kwargs`` to, by name, without ``self``."""
+    found: dict[str, inspect.Parameter] = {}
+    for base in cls.__mro__:
+        if "__init__" in vars(base):
+            parameters = list(inspect.signature(base.__init__).parameters.values())[1:]  # type: ignore[misc]
+            named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+            found = {**named, **found}
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
+    return found
+
+
 def rules_of(options: Any) -> dict[str, Rule]:
     """The rules of the fields of a dataclass, by name."""
     return {found.name: found.metadata["rule"] for found in fields(options) if "rule" in found.metadata}

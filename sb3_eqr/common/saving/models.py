@@ -20,6 +20,7 @@ from stable_baselines3.common.save_util import load_from_pkl, recursive_getattr,
 from stable_baselines3.common.type_aliases import GymEnv
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from sb3_eqr.common.checks.arguments import parameters_of
 from sb3_eqr.common.checks.validation import check_names
 from sb3_eqr.common.saving.buffers import read_buffer, write_buffer
 from sb3_eqr.common.saving.checkpoints import BUFFER, MODEL, read_manifest, restore_run, warn_of_unknown
@@ -185,7 +186,8 @@ class SafeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the file is truncated, was saved by another class, or needs ``trust``
         :raises TypeError: if a keyword is not an argument of the agent
         """
-        check_names(f"{cls.__name__}.load", kwargs, [*inspect.signature(cls.load).parameters][:-1] + _arguments_of(cls))
+        legal = {*inspect.signature(cls.load).parameters, *parameters_of(cls)} - {"policy", "kwargs"}
+        check_names(f"{cls.__name__}.load", kwargs, sorted(legal))
         content = read_model(path)
         given = {"env": None, **(custom_objects or {})}  # SB3 would make the environment that a file names
         data = {name: value for name, value in data_of(content).items() if name not in given}
@@ -293,18 +295,6 @@ class SafeFiles(OffPolicyAlgorithm):
                     f"{path} must be a complete replay buffer written by {type(self).__name__}.save_replay_buffer, "
                     f"got something else ({error}). Load another one."
                 ) from error
-
-
-def _arguments_of(cls: type) -> list[str]:
-    """Names of the arguments of a class but ``policy`` and ``env``, through the ``**kwargs`` of its subclasses."""
-    names: dict[str, None] = {}
-    for base in cls.__mro__:
-        if "__init__" in vars(base):
-            found = inspect.signature(base.__init__).parameters.values()  # type: ignore[misc]
-            names |= {p.name: None for p in found if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-            if not any(p.kind is p.VAR_KEYWORD for p in found):
-                break
-    return [name for name in names if name not in ("self", "policy", "env")]
 
 
 def _describe(buffer: ReplayBuffer | None) -> dict[str, Any]:
