@@ -46,7 +46,7 @@ def load_configuration(name: str, env_id: str = "atari", **changes: Any) -> dict
         raise ValueError(f"name must be one of the configurations {list(files)}, got {name!r}.{nearest(name, files)}")
     entries = yaml.safe_load(files[name].read_text(encoding="utf-8"))
     if env_id not in entries:
-        default = ' Any other environment has the section "default".' if "default" in entries else ""
+        default = " Any other environment has a default section, by its observations." if "default" in entries else ""
         raise ValueError(
             f"env_id must be one of the sections {list(entries)} of configuration {name!r}, got {env_id!r}.{default}"
         )

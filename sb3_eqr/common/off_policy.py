@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
@@ -22,6 +23,7 @@ from sb3_eqr.common.checks.arguments import ALGORITHM, Rule, check, check_argume
 from sb3_eqr.common.checks.finite_data import FiniteData
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
+from sb3_eqr.common.saving.callbacks import restore_progress
 from sb3_eqr.common.saving.models import SafeFiles, data_of, read_model
 
 # Arguments of the replay buffer that the algorithm sets and changes.
@@ -124,6 +126,13 @@ class EqROffPolicy(FiniteData, SafeFiles):
                 found = stack.stacked_obs.n_stack
         return self.replay_buffer_kwargs.get("frame_stack", found)
 
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)  # type: ignore[misc]
+        if self.num_timesteps > 0:
+            restore_progress(callback, self.callback_progress)
+        self.callback_progress = {}
+        return total_timesteps, callback
+
     def _log_last_round(self, check_model: bool = False) -> None:
         """Log the metrics of the last round, which are ready by now; raise if a metric or the model is not finite."""
         for update in self._monitor.collect(self.num_timesteps):  # each, because rounds may differ in their number of updates
@@ -146,6 +155,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
         the log once more, with the last updates, unless it did at this step or ``log_interval`` is ``None``.
         """
         check("total_timesteps", total_timesteps, number(0))
+        assert self.env is not None, "You must set the environment before calling learn(): pass env to load, or call set_env."
         log_name = tb_log_name or type(self).__name__
         super().learn(total_timesteps, callback, log_interval, log_name, reset_num_timesteps, progress_bar)
         self._log_last_round(check_model=True)

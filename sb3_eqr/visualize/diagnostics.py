@@ -24,7 +24,10 @@ SENTENCES = {
     "collapsed": "The latent states have collapsed to nearly a single one: {errors}. Keep reward_coef above 0, lower "
     'aet_coef and symmetry_coef, or pass policy_kwargs=dict(aet_loss="contrastive", predictor=False).',
 }
-UNLESS = '. To use the latent states themselves, train with policy_kwargs=dict(projection="none")'
+UNLESS = (
+    ". The losses compare projections, so only these are predicted well. To use the latent states themselves, train with "
+    'policy_kwargs=dict(projection="none")'
+)
 COLLAPSED = 1e-3  # squared distance on the unit sphere: directions within two degrees of each other
 
 

@@ -29,7 +29,7 @@ from sb3_eqr.trust import check_zoo_folder, read_plain, read_trusted
 from sb3_eqr.zoo.checks import fail
 from sb3_eqr.zoo.entries import find_entry
 
-FOLDER = "checkpoints"  # in the folder of a run
+FOLDER, BEST = "checkpoints", "best_model.zip"  # in the folder of a run; the latter by RL Zoo
 
 
 class RngPreserving(EventCallback):
@@ -115,7 +115,7 @@ class ResumableExperiment(ExperimentManager):
         self.args.env_kwargs = self.env_kwargs or None
         super().create_callbacks()
         if self.checkpoint_every is not None or self.resume is not None:
-            # RL Zoo evaluates Atari's agents with random actions, and a resumed run evaluates them at other steps.
+            # RL Zoo evaluates Atari's agents with random actions, in environments whose state is not in a checkpoint.
             self.callbacks = [RngPreserving(c) if isinstance(c, EvalCallback) else c for c in self.callbacks]
         if self.checkpoint_every is not None:
             folder = pathlib.Path(self.save_path) / FOLDER
@@ -124,9 +124,13 @@ class ResumableExperiment(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.resume is None:
             return super()._load_pretrained_agent(hyperparams, env)
-        model = ALGOS[self.algo].resume(checkpoints_of(self.resume), env, self.device, self.trust)  # type: ignore[attr-defined]
+        checkpoints = checkpoints_of(self.resume)
+        model = ALGOS[self.algo].resume(checkpoints, env, self.device, self.trust)  # type: ignore[attr-defined]
         if self.n_timesteps <= model.num_timesteps:
             fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {model.num_timesteps}.")
+        for run in (checkpoints.parent, checkpoints.parent.parent):
+            if (best := run / BEST).is_file():  # which a worse one will not replace
+                shutil.copy2(best, self.save_path)
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         model.verbose, model.tensorboard_log = self.verbose, self.tensorboard_log or model.tensorboard_log

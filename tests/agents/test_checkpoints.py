@@ -9,7 +9,14 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
+from stable_baselines3.common import callbacks
+from stable_baselines3.common.callbacks import (
+    CallbackList,
+    ConvertCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
@@ -67,6 +74,43 @@ def test_resuming_in_a_new_process_is_bit_identical(tmp_path):
             assert model.num_timesteps == whole.num_timesteps and model._n_updates == whole._n_updates > 20
             assert same(model, whole)
         assert not list((tmp_path / algorithm).glob(".*"))
+
+
+class Falling(EvalCallback):
+    """Finds a return of 9, and 1 less at each evaluation."""
+
+    def _on_step(self):
+        with pytest.MonkeyPatch.context() as patch:
+            value = 9.0 - len(self.evaluations_results)
+            patch.setattr(callbacks, "evaluate_policy", lambda *args, **kwargs: ([value], [5]))
+            return super()._on_step()
+
+
+def test_sb3s_callbacks_continue_in_a_resumed_run(tmp_path):
+    def learn(model, n_steps):
+        stopping = StopTrainingOnNoModelImprovement(max_no_improvement_evals=4)
+        evaluation = Falling(
+            make_vec_env(ChainEnv), None, stopping, eval_freq=8, log_path=tmp_path, best_model_save_path=tmp_path, verbose=0
+        )
+        calls = []
+        every = EveryNTimesteps(25, callback=ConvertCallback(lambda *_: calls.append(model.num_timesteps) or True))
+        checkpoints = ExactCheckpointCallback(20, tmp_path / "run")
+        model.learn(n_steps, [evaluation, every, checkpoints], reset_num_timesteps=model.num_timesteps == 0)
+        return calls, stopping
+
+    assert learn(EqRQRDQN("MlpPolicy", make_vec_env(ChainEnv), **SMALL), 23)[0] == []  # the last checkpoint is of step 20
+    best = (tmp_path / "best_model.zip").read_bytes()
+    model = EqRQRDQN.resume(tmp_path / "run", make_vec_env(ChainEnv))
+    calls, stopping = learn(model, 180)
+    assert model.num_timesteps == 48  # the sixth evaluation is the fifth without improvement
+    found = np.load(tmp_path / "evaluations.npz")
+    assert found["timesteps"].tolist() == [8, 16, 24, 32, 40, 48] and found["results"].ravel().tolist() == [9, 8, 7, 6, 5, 4]
+    assert (tmp_path / "best_model.zip").read_bytes() == best and stopping.no_improvement_evals == 5
+    assert calls == [25]
+    model = EqRQRDQN.resume(tmp_path / "run", make_vec_env(ChainEnv))
+    new = Falling(make_vec_env(ChainEnv), eval_freq=8, verbose=0)
+    model.learn(3, new)  # counts from 0, as SB3's learn without reset_num_timesteps=False
+    assert new.n_calls == 3 and not new.evaluations_results
 
 
 @pytest.fixture(scope="module")

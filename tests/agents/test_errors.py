@@ -350,7 +350,7 @@ def test_resuming_without_the_vec_normalize_or_the_replay_buffer_warns(make, tmp
     model.learn(60)
     model.save(tmp_path / "model")
     bare = type(model).load(tmp_path / "model")
-    with warnings.catch_warnings(), pytest.raises(AssertionError, match="must set the environment"):
+    with warnings.catch_warnings(), pytest.raises(AssertionError, match=r"must set the environment.*call set_env"):
         warnings.simplefilter("error")
         bare.learn(5)
     bare.set_env(make_vec_env(ChainEnv))

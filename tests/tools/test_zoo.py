@@ -234,6 +234,8 @@ def test_a_run_is_resumed_with_its_own_settings(sb3_eqr, tmp_path):
     assert "pass --trust" in sb3_eqr(f"{line} -n 400 --resume {run}", code=2).err
     sb3_eqr(f"{line} -n 400 --resume {run} --trust")
     resumed = tmp_path / "eqr_qrdqn" / "CartPole-v1_2"
+    assert np.load(resumed / "evaluations.npz")["timesteps"].tolist()[:4] == [100, 200, 300, 400]  # also those before
+    assert (resumed / "best_model.zip").exists()
     model = EqRQRDQN.load(resumed / "CartPole-v1.zip", trust=True)
     assert (model.n_envs, model.gradient_steps, model.gamma) == (2, 1, 0.9) and model.num_timesteps >= 400
     settings = read_trusted(resumed / "CartPole-v1" / "config.yml")

@@ -19,6 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_eqr.common.checks.arguments import ALGORITHM, check, integer
+from sb3_eqr.common.saving.callbacks import progress_of
 from sb3_eqr.common.saving.env_state import capture, restore
 from sb3_eqr.common.saving.files import atomic_folder, checksum, remove_leftovers
 from sb3_eqr.common.saving.plain_data import decode, encode, without_pickles
@@ -30,7 +31,12 @@ LARGEST_MANIFEST = 100 << 20  # bytes; Monitor keeps three numbers for each epis
 
 
 def write_checkpoint(
-    folder: pathlib.Path, model: BaseAlgorithm, notes: Any = None, keep: int = 1, with_buffer: bool = True
+    folder: pathlib.Path,
+    model: BaseAlgorithm,
+    notes: Any = None,
+    keep: int = 1,
+    with_buffer: bool = True,
+    callback: BaseCallback | None = None,
 ) -> pathlib.Path:
     """
     Write a checkpoint and return its path. Call this between two rollouts, in a callback's ``_on_rollout_start``. A checkpoint
@@ -40,6 +46,7 @@ def write_checkpoint(
     :param notes: additional plain data to store
     :param keep: number of checkpoints to keep, including this one
     :param with_buffer: whether to include the replay buffer
+    :param callback: the one of ``learn``, whose progress is stored
     """
     env = model.get_env()
     assert env is not None
@@ -65,6 +72,7 @@ def write_checkpoint(
             "unknown": unknown,  # classes of the environment whose state cannot be restored
             "rng": encode(get_rng_state(model.action_space)),
             "notes": encode(notes),
+            "callbacks": {} if callback is None else without_pickles(encode(progress_of(callback))),
             "sha256": {path.name: checksum_of(path) for path in sorted(partial.iterdir())},
         }
         (partial / MANIFEST).write_text(json.dumps({**manifest, "digest": digest(manifest)}), encoding="utf-8")
@@ -214,10 +222,10 @@ def restore_run(model: BaseAlgorithm, manifest: dict[str, Any], is_exact: bool) 
 
 class ExactCheckpointCallback(BaseCallback):
     """
-    Saves checkpoints from which ``resume`` continues bit for bit: model, replay buffer, VecNormalize, the environments' states
-    and the random generators, in one folder ``checkpoint-<step>`` that is complete or absent. A checkpoint is written at the
-    start of the first rollout after every ``save_freq`` steps, so never at the very end of training, and with
-    ``train_freq=128`` only at multiples of 128.
+    Saves checkpoints from which ``resume`` continues bit for bit: model, replay buffer, VecNormalize, the states of the
+    environments and random generators, and the progress of SB3's callbacks, in one folder ``checkpoint-<step>`` that is
+    complete or absent. A checkpoint is written at the start of the first rollout after every ``save_freq`` steps, so never at
+    the very end of training, and with ``train_freq=128`` only at multiples of 128.
 
     :param save_freq: steps of all environments between two checkpoints, ≥ 1
     :param save_path: folder for the checkpoints
@@ -280,7 +288,7 @@ class ExactCheckpointCallback(BaseCallback):
         self._is_called = True
         if (multiple := self.model.num_timesteps // self.save_freq) > self._last:
             self._last = multiple
-            checkpoint = write_checkpoint(self.save_path, self.model, keep=self.keep)
+            checkpoint = write_checkpoint(self.save_path, self.model, keep=self.keep, callback=self.locals["callback"])
             if self.verbose:
                 print(f"Saving a checkpoint to {checkpoint}")
 

@@ -140,6 +140,7 @@ class SafeFiles(OffPolicyAlgorithm):
 
     _make_replay_buffer: Callable[[], ReplayBuffer]  # an empty one
     _before_saving: Callable[[], None]  # if it raises an exception, the old file is kept
+    callback_progress: dict[str, Any] = {}  # of a run that was resumed; learn passes it to the callbacks
 
     def __getstate__(self) -> dict[str, Any]:
         """For ``pickle`` and ``copy``: replace the logger, which holds open files, by one without output until ``learn``."""
@@ -162,7 +163,12 @@ class SafeFiles(OffPolicyAlgorithm):
             save_to_zip_file(file, data, self.get_parameters(), variables)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule"]  # created by _setup_model
+        return [
+            *super()._excluded_save_params(),
+            "lr_schedule",
+            "exploration_schedule",
+            "callback_progress",
+        ]
 
     @classmethod
     def load(
@@ -227,6 +233,7 @@ class SafeFiles(OffPolicyAlgorithm):
         if (checkpoint / BUFFER).is_file():
             model.load_replay_buffer(checkpoint / BUFFER, trust=trust)
         restore_run(model, manifest, is_exact)
+        model.callback_progress = decode(manifest.get("callbacks", {}))
         if not is_exact:
             warn_of_unknown(manifest["unknown"])
         return model
