@@ -251,5 +251,5 @@ def test_unknown_names_raise():
         load_configuration("bbf")
     with pytest.raises(ValueError, match=r"env_id must be one of .*'atari'.*got 'CartPole-v1'"):
         load_configuration("eqr_bbf", "CartPole-v1")
-    with pytest.raises(ValueError, match=r"got .MyEnv-v0.\..* Any other environment has a default section, by its observations\.$"):
+    with pytest.raises(ValueError, match=r"got .MyEnv-v0.\..* has a default section, by its observations\.$"):
         load_configuration("eqr_sac", "MyEnv-v0")
