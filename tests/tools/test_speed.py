@@ -58,3 +58,13 @@ def test_parts():
     for row in (without, with_eqr):
         parts = [row[f"{part}_ms"] for part in ("sample", "Adam", "losses", "backward", "clip", "target")]
         assert min(parts) > 0 and 0.5 * row["update_ms"] < sum(parts) < row["update_ms"]
+
+
+@pytest.mark.slow
+def test_captured_updates_are_compared_with_eager_ones():
+    """What a GPU is lent for, on a CPU: all three agents are eager, and eager updates are deterministic."""
+    (table,) = speed.measure_graph(speed.parse(["--rounds", "1", "--threads", "1"]))
+    assert [row["name"] for row in table.rows] == list(EQR_AGENTS)
+    for row in table.rows:
+        assert row["eager_again"] == row["captured"] == 0 and row["ok"]
+        assert row["capture"] == "a CUDA graph needs a GPU, and the device is 'cpu'"
