@@ -1,6 +1,5 @@
 """Components of EqRRainbow and options from later work, compared with hand-computed numbers or other implementations."""
 
-import math
 import warnings
 from dataclasses import replace
 
@@ -13,7 +12,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_eqr import EqRRainbow
 from sb3_eqr.common.networks.encoders import ConvExtractor, ImpalaExtractor, ImpalaTrunk, rescaled
 from sb3_eqr.common.networks.layers import NoisyLinear
-from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_rainbow.policies import EqRRainbowPolicy
 from tests.models import EITHER, MAKERS, PAPER, all_finite, loss_terms, same, tensors, untrained
 from tests.toys import ChainEnv, ImageEnv
@@ -40,30 +38,6 @@ def set_head(stream, probabilities):
     th.nn.init.zeros_(stream[-1].weight)
     with th.no_grad():
         stream[-1].bias.copy_(logs.T.flatten())  # (atoms, actions)
-
-
-@pytest.mark.parametrize("double_q, goal", [(True, [0.0, 0.375, 0.625]), (False, [0.0, 0.0, 1.0])])
-def test_double_q_by_hand(double_q, goal):
-    """
-    The online network prefers action 0, the target network action 2. The n-step return is 0.5 and γⁿ is 0.5, so the atoms
-    -1, 0, 1 move to 0, 0.5, 1. The middle one of action 0's (1/4, 1/4, 1/2) is shared equally by the atoms 0 and 1.
-    """
-    model = hand_made_agent(double_q=double_q, policy_kwargs={"dueling": False})
-    sure_of_1 = [1e-30, 1e-30, 1.0]
-    current = [0.5, 0.375, 0.125]
-    set_head(model.q_net.head.advantage, [[0.25, 0.25, 0.5], current, [0.5, 0.25, 0.25]])
-    set_head(model.q_net_target.head.advantage, [[0.25, 0.25, 0.5], [0.25, 0.5, 0.25], sure_of_1])
-    obs = th.zeros(1, 3)
-    one = th.ones(1, 1)
-    samples = SequenceReplayBufferSamples(obs, one.long(), obs, 0 * one, one / 2, one / 2, np.zeros(1, int), th.ones(1))
-    terms = loss_terms(model, samples)
-    cross_entropy = -sum(g * math.log(c) for g, c in zip(goal, current, strict=True))
-    entropy = -sum(g * math.log(g) for g in goal if g > 0)
-    assert terms.losses["td"].item() == pytest.approx(cross_entropy, rel=1e-5)
-    assert terms.priorities.item() == pytest.approx(cross_entropy - entropy, rel=1e-5)
-    assert terms.q_values.item() == pytest.approx(-0.5 + 0.125)
-    terminal = loss_terms(model, samples._replace(dones=one))  # all the mass is at 0.5: half goes to 0, half to 1
-    assert terminal.losses["td"].item() == pytest.approx(-0.5 * (math.log(0.375) + math.log(0.125)), rel=1e-5)
 
 
 def outputs_of(network, obs):
