@@ -363,6 +363,7 @@ def test_loading_executes_no_code(make, model, tmp_path, monkeypatch):
             with pytest.raises(ValueError, match="pass trust=True"):
                 load("forged")
         model.set_parameters("forged")  # does not read attributes
+        model.load_representation("forged")
     rewrite("model.zip", "weights.zip", **{"policy.pth": evil})
     for load in (make.algorithm.load, model.set_parameters, model.load_representation):
         with pytest.raises(Exception, match=r"weights_only|Weights only"):
@@ -375,6 +376,8 @@ def test_loading_executes_no_code(make, model, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"must be a complete replay buffer written by .*another zip file"):
         model.load_replay_buffer("buffer")
     assert not pathlib.Path("ran").exists()
+    make.algorithm.load("forged", trust=True)
+    assert pathlib.Path("ran").exists()
 
 
 def test_a_buffer_of_more_environments_is_named(make, model, tmp_path):
