@@ -118,12 +118,6 @@ def test_the_callers_dictionaries_are_not_changed(make):
     assert own.policy.optimizer.defaults["betas"] == (0.5, 0.9) and own.policy.optimizer.defaults["eps"] == 1.5e-4
 
 
-def test_the_learning_rate_schedule_applies_to_the_latent_model(make):
-    model = make(ChainEnv(), learning_rate=lambda progress: 1e-3 * progress).learn(50)
-    (group,) = model.policy.optimizer.param_groups
-    assert group["lr"] == 0.0 and {*map(id, model.policy.latent_model.parameters())} <= {*map(id, group["params"])}
-
-
 @pytest.mark.parametrize(("total_timesteps", "expected"), [(300, 30), (19_990, 1_999), (20_000, 2_000), (100_000, 2_000)])
 def test_learning_starts_after_a_tenth_of_the_first_run_and_at_most_2000_steps(make, total_timesteps, expected):
     model = make.algorithm("MlpPolicy", ChainEnv(), device="cpu").learn(0)  # learning nothing chooses nothing
