@@ -513,6 +513,10 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
 def test_wrong_arguments_fail_before_the_first_step(agent, kwargs, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make(agent, **kwargs)
+
+
+@EACH
+def test_discrete_actions_are_refused(agent):
     with pytest.raises(AssertionError, match="Use EqRQRDQN or EqRRainbow for a Discrete one"):
         make(agent, "CartPole-v1")
 
