@@ -101,8 +101,6 @@ def test_wrong_action_spaces_raise(make, space):
 def test_several_environments(make, n_envs):
     model = make(make_vec_env(ChainEnv, n_envs), train_freq=2).learn(100)
     assert model.replay_buffer.n_envs == n_envs and model._n_updates > 0
-    with pytest.raises(AssertionError, match="one env when doing episodic training"):
-        make(make_vec_env(ChainEnv, 2), train_freq=(1, "episode")).learn(10)
 
 
 def test_the_callers_dictionaries_are_not_changed(make):

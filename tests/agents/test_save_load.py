@@ -130,17 +130,10 @@ def test_set_parameters(make, model, tmp_path):
     parameters = model.get_parameters()
     missing = deepcopy(parameters)
     name = next(name for name in missing["policy"] if name.startswith("latent_model.transition"))
-    value = missing["policy"].pop(name)
+    del missing["policy"][name]
     with pytest.raises(RuntimeError, match="Missing key"):
         other.set_parameters(missing)
     other.set_parameters(missing, exact_match=False)
-    missing["policy"]["extra"] = value
-    with pytest.raises(RuntimeError, match="Unexpected key"):
-        other.set_parameters({**missing, "policy": {**missing["policy"], name: value}})
-    with pytest.raises(ValueError, match="invalid object name"):
-        other.set_parameters({**parameters, "actor": {}})
-    with pytest.raises(ValueError, match="Names of parameters do not match"):
-        other.set_parameters({"policy": parameters["policy"]})
     wider = make(ChainEnv(), policy_kwargs={"latent_hidden_dim": 24})
     before = tensors(wider)
     with pytest.raises(RuntimeError, match="size mismatch"):
