@@ -262,6 +262,7 @@ def test_the_algorithm_draws_as_without_a_latent_model(agent):
 def test_no_learning_rate_is_negative_in_the_last_rollout(agent):
     env = make_vec_env(MoveEnv, 8)
     model = make(agent, env, learning_rate=lambda remaining: 1e-3 * remaining).learn(100)  # 104 steps
+    assert model.policy.latent_optimizer in model._optimizers()
     assert {group["lr"] for optimizer in model._optimizers() for group in optimizer.param_groups} == {0.0}
 
 
@@ -326,13 +327,6 @@ def test_attributes_that_change_between_calls_of_learn_hold_for_replay(agent, st
     model.prediction_depth, model.n_steps, model.gamma = 4, 3, 0.5
     buffer = model.learn(60).replay_buffer
     assert (buffer.prediction_depth, buffer.n_steps, buffer.gamma) == (4, 3, 0.5)
-
-
-@EACH
-def test_the_learning_rate_of_the_latent_model_follows_the_schedule(agent):
-    env = make_vec_env(MoveEnv, 8, seed=0)  # 104 steps of 100 make the schedule negative
-    optimizer = make(agent, env, learning_rate=lambda remaining: 1e-3 * remaining).learn(100).policy.latent_optimizer
-    assert optimizer.param_groups[0]["lr"] == 0.0
 
 
 @EACH
@@ -519,6 +513,10 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
 def test_wrong_arguments_fail_before_the_first_step(agent, kwargs, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make(agent, **kwargs)
+
+
+@EACH
+def test_discrete_actions_are_refused(agent):
     with pytest.raises(AssertionError, match="Use EqRQRDQN or EqRRainbow for a Discrete one"):
         make(agent, "CartPole-v1")
 

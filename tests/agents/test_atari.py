@@ -4,15 +4,11 @@ import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_eqr.common.replay.buffers import SequenceReplayBuffer
 from sb3_eqr.envs import atari, make_atari100k_env
 from sb3_eqr.envs.atari import Atari100kWrapper
-from tests.models import draw
 
 
 def games(env):
@@ -117,33 +113,6 @@ def test_the_step_limit_follows_the_paper():
     env.reset()
     first, second = (env.step(np.array([0, 0]))[0][i] for i in (0, 1))
     assert not np.array_equal(first, second)  # different seeds give different no-ops
-
-
-def test_replay_of_real_games_equals_the_plain_buffer():
-    """Every frame is the same, bit for bit, across lost lives, terminal observations and wrap-around."""
-    env = make_atari100k_env("Breakout", n_envs=2, seed=0)
-    obs = env.reset().transpose(0, 3, 1, 2)
-    space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
-    plain = ReplayBuffer(300, space, env.action_space, "cpu", 2)
-    ours = SequenceReplayBuffer(300, space, env.action_space, "cpu", 2, frame_stack=4)
-    rng = np.random.default_rng(0)
-    ends = 0
-    for _ in range(260):
-        actions = rng.integers(4, size=2)
-        new_obs, rewards, dones, infos = env.step(actions)
-        new_obs = new_obs.transpose(0, 3, 1, 2)
-        next_obs = new_obs.copy()
-        for i in np.flatnonzero(dones):
-            next_obs[i] = infos[i]["terminal_observation"].transpose(2, 0, 1)
-        ends += dones.sum()
-        for buffer in (plain, ours):
-            buffer.add(obs, next_obs, actions, rewards, dones, infos)
-        obs = new_obs
-    assert ends > 3
-    a, b = draw(plain, 400), draw(ours, 400)
-    for field in ("observations", "actions", "next_observations", "dones", "rewards"):
-        assert th.equal(getattr(a, field), getattr(b, field))
-    assert ours.nbytes / 300 < 8_500
 
 
 def test_the_wrapper_for_rl_zoo_gives_the_training_environment():

@@ -6,7 +6,6 @@ import warnings
 
 import pytest
 import torch as th
-import yaml
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -18,7 +17,7 @@ from sb3_eqr.benchmark.suites import load_suite
 from sb3_eqr.common.networks.encoders import ImpalaTrunk, NormalizedExtractor
 from sb3_eqr.common.networks.layers import NoisyLinear
 from sb3_eqr.common.resets import ResetSchedule
-from sb3_eqr.configurations import ZOO_KEYS, configuration_files, merged, with_schedule
+from sb3_eqr.configurations import configuration_files, merged, with_schedule
 from tests.models import all_finite
 from tests.toys import ImageEnv
 
@@ -100,6 +99,9 @@ def test_table_5(kind, name):
         assert (policy.options.projection, policy.options.latent_tau) == ("own", 1.0)
         assert isinstance(policy.online.features_extractor, NormalizedExtractor)
         assert latent.projection.weight.shape == (256, 72) and latent.predictor.weight.shape == (256, 256)
+        assert model.buffer_size == 100_000
+        if kind is EqRRainbow:
+            assert (policy.v_min, policy.v_max, policy.spread_init) == (-10, 10, 0.05)
         n_features, sigma_init = 3136, 0.1
     head = policy.online.head
     assert (head.n_atoms, policy.net_arch, policy.sigma_init) == (51, [256], sigma_init) and head.value is not None
@@ -190,19 +192,6 @@ def test_eqr_bbf_follows_the_papers_recipe():
     assert (model.prediction_depth, model.aet_coef, model.symmetry_coef) == (5, 5, 5)
     assert (model.gradient_steps, model.train_freq.frequency, model.batch_size) == (2, 1, 32)
     assert model.policy.act_with_target and model.double_q
-
-
-def test_the_python_defaults_are_those_of_our_first_runs():
-    """Their file has every value; settings/atari builds on the defaults."""
-    env = VecFrameStack(make_vec_env(lambda: ImageEnv((36, 36, 1))), 4)
-    default = EqRRainbow("CnnPolicy", env, gradient_steps=1)
-    default._setup_learn(100_000, None)  # learning_starts follows the length of the run
-    entry = yaml.safe_load((ROOT / "experiments" / "settings" / "atari100k" / "defaults.yml").read_text())["atari"]
-    written = {key: value for key, value in entry.items() if key not in (*ZOO_KEYS, "callback")}
-    written |= written.pop("replay_buffer_kwargs") | written.pop("policy_kwargs")
-    found = {**vars(default.replay_buffer), **vars(default.policy), **vars(default.policy.options), **vars(default)}
-    found |= {"train_freq": default.train_freq.frequency, "n_blocks": default.policy.latent_model.n_blocks}
-    assert {key: found[key] for key in written} == written
 
 
 def test_atari_has_the_recipe_of_our_runs():

@@ -101,8 +101,6 @@ def test_wrong_action_spaces_raise(make, space):
 def test_several_environments(make, n_envs):
     model = make(make_vec_env(ChainEnv, n_envs), train_freq=2).learn(100)
     assert model.replay_buffer.n_envs == n_envs and model._n_updates > 0
-    with pytest.raises(AssertionError, match="one env when doing episodic training"):
-        make(make_vec_env(ChainEnv, 2), train_freq=(1, "episode")).learn(10)
 
 
 def test_the_callers_dictionaries_are_not_changed(make):
@@ -116,12 +114,6 @@ def test_the_callers_dictionaries_are_not_changed(make):
         assert named.policy.optimizer.defaults["eps"] == expected
     own = make(ChainEnv(), policy_kwargs={"optimizer_kwargs": {"betas": (0.5, 0.9)}})
     assert own.policy.optimizer.defaults["betas"] == (0.5, 0.9) and own.policy.optimizer.defaults["eps"] == 1.5e-4
-
-
-def test_the_learning_rate_schedule_applies_to_the_latent_model(make):
-    model = make(ChainEnv(), learning_rate=lambda progress: 1e-3 * progress).learn(50)
-    (group,) = model.policy.optimizer.param_groups
-    assert group["lr"] == 0.0 and {*map(id, model.policy.latent_model.parameters())} <= {*map(id, group["params"])}
 
 
 @pytest.mark.parametrize(("total_timesteps", "expected"), [(300, 30), (19_990, 1_999), (20_000, 2_000), (100_000, 2_000)])

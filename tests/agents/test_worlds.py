@@ -99,6 +99,9 @@ def test_an_agent_can_be_built(env_id):
         (lambda: StarField().reset(options={"translation": [0, 0, 1]}), r"translation must be an array of shape \(3,\)"),
         (lambda: StarField(False).reset(options={"translation": [0, 0, 0]}), "must only contain rotation, got 'translation'"),
         (lambda: StarField(False).step(6), r"action must be in Discrete\(6\), got 6"),
+        (lambda: PlanarBody().reset(options={"position": (np.nan, 0.0)}), "position must be two finite numbers"),
+        (lambda: PlanarBody().reset(options={"position": (0.0, 0.0, 0.0)}), "position must be two finite numbers"),
+        (lambda: PlanarBody().reset(options={"pos": (0.0, 0.0)}), "must only contain position, angle, got 'pos'"),
     ],
 )
 def test_invalid_arguments_raise(make, message):
@@ -407,17 +410,6 @@ def test_the_planar_body_moves_by_elements_of_SE2():
         assert reward == pytest.approx(-np.hypot(*expected[:2, 2])) and not (terminated or truncated)
     _, info = env.reset(options={"position": (0.5, -0.25), "angle": 7.0})
     assert info["angle"] == pytest.approx(7.0 - 2 * pi) and tuple(info["position"]) == (0.5, -0.25)
-
-
-@pytest.mark.parametrize("position", [(np.nan, 0.0), (0.0, 0.0, 0.0)])
-def test_a_planar_body_starts_at_two_finite_numbers(position):
-    with pytest.raises(ValueError, match="position must be two finite numbers"):
-        PlanarBody().reset(options={"position": position})
-
-
-def test_unknown_options_of_the_planar_body_are_named():
-    with pytest.raises(ValueError, match="must only contain position, angle, got 'pos'"):
-        PlanarBody().reset(options={"pos": (0.0, 0.0)})
 
 
 def test_the_noise_of_the_planar_body_does_not_move_it():

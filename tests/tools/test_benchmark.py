@@ -88,8 +88,10 @@ def test_from_an_empty_folder_to_scores(files, call, cluster):
     assert counts.droplevel("kind").to_dict() == {(*run, step): n for run, row in expected.items() for step, n in row.items()}
     assert read_suite(files / "b" / "suite.yml").games == ["CartPole", "Acrobot"]
     assert "8 of 8 runs are already finished." in call("run b").out
+    assert "8 runs in b.jsonl.xz" in call("pack b b.jsonl.xz").out
     (files / "b/runs/dqn-fast/Acrobot/1/result.json").unlink()
-    call("run b")
+    assert "1 of 8 runs are left" in call("run b --stop-after 0.001").out
+    assert "All runs are finished" in call("run b").out
     result = json.loads((files / "b/runs/dqn-fast/Acrobot/1/result.json").read_text())
     assert result["command"].startswith(f"sb3-eqr benchmark {line}")  # not the command that resumed it
 

@@ -23,9 +23,7 @@ from sb3_eqr.benchmark.runs import ERROR, LOCK, RESULT, STOPPED, SUITE, Run, Set
 from sb3_eqr.benchmark.suites import choose, load_suite, read_suite
 from sb3_eqr.benchmark.training import execute
 from sb3_eqr.common.saving.checkpoints import find_checkpoints
-from sb3_eqr.common.saving.env_state import capture, restore
 from sb3_eqr.envs import make_atari100k_env
-from sb3_eqr.envs.atari import Atari100kWrapper
 from tests.toys import ChainEnv
 
 STEPS = 160
@@ -119,7 +117,8 @@ def test_the_contents_of_the_result(tmp_path):
     assert training["step"] == np.cumsum(training["length"]).tolist() and training["step"][-1] <= STEPS
     assert training["score"] == training["length"]  # raw scores of CartPole, although the agent learns from normalised rewards
     assert result["entry"]["hyperparameters"] == run.entry and result["protocol"] == run.protocol
-    assert result["versions"]["torch"] and result["machine"]["device"] == "cpu" and result["machine"]["threads"] == 1
+    machine = {"device": "cpu", "threads": 1, "updates": "eager"}
+    assert result["versions"]["torch"] and result["machine"].items() >= machine.items()
     assert result["wall_clock_s"] >= result["training_seconds"] > 0
     assert result["steps_per_second"] == pytest.approx(STEPS / result["training_seconds"], abs=0.01)
     assert {"aet_loss", "symmetry_loss", "reward_loss", "td_loss", "td_state_gradient", "step"} <= result["losses"][-1].keys()
@@ -317,28 +316,6 @@ def test_scores_and_lengths_of_atari_are_those_of_full_games():
     assert len(scores) == len(lengths) == 3 and len(set(lengths)) > 1
     assert all(100 < length < 500 for length in lengths) and 0 < sum(scores) < 50
     assert (np.random.get_state()[1] == state).all()
-
-
-def test_atari_games_are_saved_in_the_middle():
-    """With stacked frames, lives and pending no-ops, a restored game continues like the original."""
-    make = lambda: VecFrameStack(make_vec_env("BreakoutNoFrameskip-v4", 1, seed=1, wrapper_class=Atari100kWrapper), 4)  # noqa: E731
-    env, copied = make(), make()
-    rng = np.random.default_rng(0)
-    env.reset()
-    for _ in range(200):
-        env.step(rng.integers(0, env.action_space.n, 1))
-    state, hidden = capture(env)
-    assert not hidden
-    copied.reset()
-    restore(copied, json.loads(json.dumps(state)), wrappers_only=False)
-    lives = []
-    for _ in range(70):
-        actions = rng.integers(0, env.action_space.n, 1)
-        (obs, rewards, dones, infos), (*others, other_infos) = env.step(actions), copied.step(actions)
-        assert all(np.array_equal(mine, other) for mine, other in zip((obs, rewards, dones), others, strict=True))
-        assert infos[0]["lives"] == other_infos[0]["lives"]
-        lives.append(infos[0]["lives"])
-    assert min(lives) < lives[0] < lives[-1]  # a life was lost, and a new game has started
 
 
 def timeout_of_the_last(checkpoint, run, folder, done, timeout):

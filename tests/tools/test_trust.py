@@ -1,16 +1,16 @@
-"""The table of docs/files.md: which commands run code that files from others name. Each line is executed."""
+"""The table of docs/files.md: which commands run code that files from others name. Each line is executed, the first
+by ``test_loading_executes_no_code``."""
 
 import pathlib
 import pickle
 import re
-import shutil
 
 import pytest
 import torch as th
 import yaml
 from stable_baselines3 import DQN
 
-from sb3_eqr import EqRQRDQN, EqRRainbow, ExactCheckpointCallback
+from sb3_eqr import EqRQRDQN, ExactCheckpointCallback
 from sb3_eqr.eqr_sac import EqRSACPolicy
 from sb3_eqr.trust import check_zoo_folder, is_plain
 
@@ -103,21 +103,6 @@ def test_commands_that_run_code(hostile, sb3_eqr, tmp_path):
     assert ran(sb3_eqr, f"enjoy --algo dqn {place}")
     hostile(**SETTINGS[3])
     assert ran(sb3_eqr, f"enjoy --algo eqr_qrdqn {place} --trust")
-
-
-def test_files_that_run_no_code_without_trust(hostile, tmp_path):
-    folder = hostile()
-    model = EqRQRDQN("MlpPolicy", "CartPole-v1", **SMALL)
-    pathlib.Path("buffer.pkl").write_bytes(pickle.dumps(Runs()))
-    assert not ran(model.load_replay_buffer, "buffer.pkl")
-    assert ran(lambda: model.load_replay_buffer("buffer.pkl", trust=True))
-    model.learning_rate = Runs()
-    model.save("model")
-    for load in (EqRQRDQN.load, model.set_parameters, model.load_representation, EqRRainbow.load):
-        assert not ran(load, "model")
-    assert ran(lambda: EqRQRDQN.load("model", trust=True))
-    shutil.copytree(folder, "checkpoint-000000000001")
-    assert not ran(EqRQRDQN.resume, "checkpoint-000000000001", model.get_env())
 
 
 @pytest.mark.parametrize("text", ["dict(a=[1, -2.5], b=dict(c='x'))", "{'a': (1, None)}", "True"])

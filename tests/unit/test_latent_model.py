@@ -262,17 +262,6 @@ def test_losses_and_gradients_of_a_singular_state_are_finite():
     assert th.isfinite(state.grad).all() and all(th.isfinite(loss).all() for loss in losses.values())
 
 
-@pytest.mark.parametrize("absent", LOSSES)
-def test_only_the_named_losses_are_computed(absent):
-    model, case = random_case()
-    found = []
-    for names in (LOSSES, [name for name in LOSSES if name != absent]):
-        th.manual_seed(0)
-        found.append(model(**{**case, "names": names}))
-    assert found[1].keys() == set(LOSSES) - {absent}
-    assert all(th.equal(loss, found[0][name]) for name, loss in found[1].items())
-
-
 def test_without_a_group_the_network_predicts_the_next_state():
     free = make_model("none(6)", 1, 3).eval()
     expected = free.transition(th.cat([th.ones(3, 6), th.eye(3)], dim=1))
