@@ -1,6 +1,7 @@
 """The algorithm: arguments, components and training loop of all EqR agents (Algorithm 1)."""
 
 import io
+import math
 import pathlib
 import warnings
 from collections.abc import Callable
@@ -374,14 +375,14 @@ class EqRAlgorithm(EqROffPolicy):
     def _updates_left(self) -> float:
         """How many updates later rounds of this call of ``learn`` will make; expected if rounds are episodes, at first NaN."""
         frequency: Any = self.train_freq
+        steps = max(self._total_timesteps - max(self.num_timesteps, self.learning_starts or 0), 0)
+        if frequency.unit is TrainFrequencyUnit.STEP:
+            per_round = frequency.frequency * self.n_envs  # the last round is whole, too
+            return math.ceil(steps / per_round) * (per_round if self.gradient_steps < 0 else self.gradient_steps)
         if self.gradient_steps < 0:
-            per_step = 1.0
-        elif frequency.unit is TrainFrequencyUnit.STEP:
-            per_step = self.gradient_steps / (frequency.frequency * self.n_envs)
-        else:
-            episodes = self._episode_num / self.num_timesteps if self.num_timesteps else np.nan  # per step; not known at first
-            per_step = self.gradient_steps * episodes / frequency.frequency
-        return per_step * (self._total_timesteps - max(self.num_timesteps, self.learning_starts or 0))
+            return steps
+        episodes = self._episode_num / self.num_timesteps if self.num_timesteps else np.nan  # per step; not known at first
+        return self.gradient_steps * episodes / frequency.frequency * steps
 
     def _start_round(self, buffer: SequenceReplayBuffer) -> None:
         self._log_last_round()

@@ -128,7 +128,9 @@ class EqROffPolicy(FiniteData, SafeFiles):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)  # type: ignore[misc]
-        if self.num_timesteps > 0:
+        if self.num_timesteps == 0:
+            self._dumped_steps = -1
+        else:
             restore_progress(callback, self.callback_progress)
         self.callback_progress = {}
         return total_timesteps, callback

@@ -143,6 +143,14 @@ def test_the_buffer_uses_the_annealed_n_and_gamma(make, monkeypatch):
 # ---------------------------------------------------------------------------------------------- resets
 
 
+@pytest.mark.parametrize("n_envs, train_freq, n_steps", [(1, 64, 65), (8, 8, 70)])
+def test_the_last_round_is_whole_and_counts_for_resets(make, n_envs, train_freq, n_steps):
+    """Two rounds of 128 updates, although few steps are left for the second: 64 updates follow each of three resets."""
+    rounds = {"train_freq": train_freq, "gradient_steps": 128, "learning_starts": 0, "resets": {"interval": 64}}
+    model = make(DummyVecEnv([ChainEnv] * n_envs), **rounds).learn(n_steps)
+    assert model._n_updates == 256 and model._resets.done == [64, 128, 192]
+
+
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
 def test_a_reset_bit_for_bit(make, alpha, projection):
     network = PAPER if projection == "head" else {"projection": projection}

@@ -426,6 +426,48 @@ def test_the_step_at_which_a_callback_stops_learn_is_stored(make, kind):
     assert buffer.pos == 20 and np.flatnonzero(ends).tolist() == [9, 19]
 
 
+@pytest.mark.parametrize("place", ["step", "reset"])
+def test_a_run_that_is_interrupted_in_the_environment_begins_a_new_episode(make, place):
+    """By Ctrl-C after the environment has moved: the step that nobody saw, or half of one, is not stored."""
+
+    class Clock(SampledEnv):
+        stops = iter([KeyboardInterrupt])
+
+        def observe(self):
+            return np.full(1, self.time, np.float32)
+
+        def reset(self, **kwargs):
+            if place == "reset" and self.n_episodes == 1:
+                for error in self.stops:
+                    raise error
+            return super().reset(**kwargs)
+
+        def step(self, action):
+            found = super().step(action)
+            if place == "step" and self.n_episodes == 1 and self.time == 5:
+                for error in self.stops:
+                    raise error
+            return found
+
+    model = make(Clock(spaces.Box(0, 10, (1,), np.float32)), learning_starts=1_000)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100)
+    model.learn(15, reset_num_timesteps=False)
+    buffer, n_before = model.replay_buffer, 14 if place == "step" else 9
+    rows = np.arange(n_before + 15)
+    now, then = (buffer._stores[""].observations(rows, 0 * rows, following=f)[:, 0].tolist() for f in (False, True))
+    assert now == [*[*range(10), *range(10)][:n_before], *range(10), *range(5)] and buffer.pos == len(rows)
+    assert then == [n + 1 for n in now]
+
+
+def test_each_call_of_learn_writes_its_last_log(make, tmp_path):
+    model = make(SampledEnv(spaces.Box(-1, 1, (3,), np.float32), length=1_000))
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    for _ in range(3):
+        model.learn(60)  # no episode ends, and all three end at step 60
+    assert pd.read_csv(tmp_path / "progress.csv")["time/total_timesteps"].tolist() == [60, 60, 60]
+
+
 @EITHER
 def test_errors_of_callbacks_are_not_the_environments(make):
     class Short(ChainEnv):

@@ -47,11 +47,13 @@ class FiniteData(OffPolicyAlgorithm):
 
     def _finish_step(self, callback: BaseCallback) -> None:
         """Do what SB3 does after a callback has seen a step, if the training was stopped before that."""
+        # The environment may have made a step that nobody has seen, so the next call of learn must reset it.
         if self._stored_steps == self.num_timesteps:
-            return  # the error came before the step, or from the environment
+            self._last_obs = None
+            return
         self._stored_steps = self.num_timesteps
         if callback.num_timesteps != self.num_timesteps:
-            self._last_obs = None  # nobody has seen this step, so the next call of learn must reset the environment
+            self._last_obs = None
             return
         seen = callback.locals
         self._update_info_buffer(seen["infos"], seen["dones"])
