@@ -163,12 +163,7 @@ class SafeFiles(OffPolicyAlgorithm):
             save_to_zip_file(file, data, self.get_parameters(), variables)
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "lr_schedule",
-            "exploration_schedule",
-            "callback_progress",
-        ]
+        return [*super()._excluded_save_params(), "lr_schedule", "exploration_schedule", "callback_progress"]
 
     @classmethod
     def load(
