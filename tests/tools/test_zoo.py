@@ -6,6 +6,7 @@ import os
 import pathlib
 import re
 import signal
+import subprocess
 import sys
 
 import gymnasium as gym
@@ -393,6 +394,39 @@ def test_the_flags_of_rl_zoo_together(sb3_eqr, tmp_path):
     assert "Loading replay buffer" in shown and "Loading saved VecNormalize stats" in shown
     continued = EqRQRDQN.load(tmp_path / "eqr_qrdqn" / "CartPole-v1_2" / "CartPole-v1.zip")
     assert continued.num_timesteps == 100 and continued._n_updates == model._n_updates + 100  # two steps, two updates
+
+
+def run_sb3_eqr(line, folder, **environment):
+    """Run a command line in its own process."""
+    command = [sys.executable, "-m", "sb3_eqr.zoo", *line.split()]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.slow
+def test_two_processes_share_one_search(tmp_path):
+    """Trials are shared; none is lost or repeated."""
+    line = "train --algo eqr_qrdqn --env CartPole-v1 -n 120 -params learning_starts:100 -optimize --max-total-trials 6 "
+    line += "--n-trials 6 --n-evaluations 2 --eval-episodes 1 --storage search.log --study-name s --no-optim-plots -f logs"
+    processes = [run_sb3_eqr(f"{line} --seed {seed}", tmp_path) for seed in (1, 2)]
+    shown = [process.communicate(timeout=200)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], shown
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(tmp_path / "search.log")))
+    trials = optuna.load_study(study_name="s", storage=storage).trials
+    assert {trial.state for trial in trials} <= {optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED}
+    told = [int(number) for text in shown for number in re.findall(r"Trial (\d+) (?:finished|pruned)", text)]
+    assert len(trials) >= 6 and sorted(told) == list(range(len(trials)))  # each one once, in one of the two processes
+
+
+@pytest.mark.slow
+def test_weights_and_biases_offline(tmp_path):
+    pytest.importorskip("wandb")
+    line = "train --algo eqr_qrdqn --env CartPole-v1 -n 1100 --eval-freq -1 --track --wandb-project-name eqr -f logs"
+    process = run_sb3_eqr(line, tmp_path, WANDB_MODE="offline", WANDB_SILENT="true")
+    shown, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, shown
+    assert list((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
+    assert list((tmp_path / "runs").rglob("events.*"))
 
 
 def test_pushing_to_the_hub_and_loading_from_it(sb3_eqr, tmp_path, monkeypatch):
