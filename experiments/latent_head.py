@@ -17,6 +17,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from experiments import markdown
 from experiments.continuous import Episodes
@@ -33,6 +34,7 @@ from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 from sb3_eqr.eqr_qrdqn.policies import EqRQRDQNPolicy
 
 STEPS = {"LunarLander-v3": 60_000, "Acrobot-v1": 20_000, "MountainCar-v0": 30_000, "CartPole-v1": 10_000}
+NORMALIZED = ("MountainCar-v0",)  # tasks whose section in zoo_hyperparams/eqr_qrdqn.yml normalises observations
 ARMS = ("head_none", "head_se2", "eqr", "off")
 LATENT = {"latent_tau": 0.005, "latent_norm": "layer", "projection": "own", "predictor": True, "parameterization": "euler"}
 LOSSES = {"prediction_depth": 2, "aet_coef": 1.0, "reward_coef": 1.0, "symmetry_coef": 0.0}
@@ -93,6 +95,12 @@ class LatentHeadQRDQN(EqRQRDQN):
         self.objective = LatentHeadObjective(self.policy, **self._objective_options)
 
 
+def make_env(task: str, n_envs: int, seed: int) -> VecEnv:
+    """Environments as that section says."""
+    env = make_vec_env(task, n_envs, seed=seed)
+    return VecNormalize(env, norm_reward=False) if task in NORMALIZED else env
+
+
 def make(task: str, arm: str, seed: int) -> EqRQRDQN:
     """An agent with the settings of the task in zoo_hyperparams/eqr_qrdqn.yml, and what the arm changes."""
     off = {"prediction_depth": 0, "policy_kwargs": {"group": None}} if arm == "off" else {}
@@ -103,7 +111,7 @@ def make(task: str, arm: str, seed: int) -> EqRQRDQN:
         group = {"group": "none(72)"} if arm == "head_none" else group
         kept = {name: value for name, value in settings["policy_kwargs"].items() if name not in OTHERS}
         settings |= {**LOSSES, "policy_kwargs": {**kept, **LATENT, **group}}
-    return kind("MlpPolicy", make_vec_env(task, 1, seed=seed), **settings, seed=seed, device="cpu")
+    return kind("MlpPolicy", make_env(task, 1, seed), **settings, seed=seed, device="cpu")
 
 
 def train(file: pathlib.Path, tasks: list[str], arms: list[str], seeds: list[int]) -> None:
@@ -115,7 +123,11 @@ def train(file: pathlib.Path, tasks: list[str], arms: list[str], seeds: list[int
         model: Any = make(task, arm, seed)
         model.learn(STEPS[task], callback=Episodes())
         score: Any
-        score, _ = evaluate_policy(model, make_vec_env(task, 10, seed=10_000 + seed), 50)
+        eval_env = make_env(task, 10, 10_000 + seed)
+        if isinstance(eval_env, VecNormalize):
+            eval_env.training = False
+            sync_envs_normalization(model.get_env(), eval_env)
+        score, _ = evaluate_policy(model, eval_env, 50)
         run = {
             "task": task,
             "arm": arm,
