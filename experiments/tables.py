@@ -48,6 +48,7 @@ AXES = {
     "goals": "goals reached per tenth of the run",
 }
 TITLES = {"torus_of_4": "torus, 4 distractors", "torus_of_8": "torus, 8 distractors", "pendulum": "PixelPendulum-v0"}
+TITLES |= {"UpNDown": "Up N Down", "MsPacman": "Ms Pacman"}
 VERDICTS = {  # colour and marker of each
     "better with EqR": (COLORS[0], "^"),
     "no clear difference": (GREY, "o"),
@@ -79,11 +80,11 @@ COMPARED: list[Arguments] = [
     ("Torus, 8 distractors", ["worlds.jsonl.xz"], ["torus_of_8"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Torus, 4 distractors", ["worlds.jsonl.xz"], ["torus_of_4"], DEFAULTS, "goals", "worlds.md#a-torus-with-distractors"),
     ("Large torus", ["worlds.jsonl.xz"], ["large_torus"], DEFAULTS, "goals", "worlds.md#a-large-torus"),
-    ("Pendulum", ["worlds.jsonl.xz"], ["pendulum"], DEFAULTS, "return", "worlds.md#a-pendulum"),
+    ("Pendulum from images, EqRQRDQN", ["worlds.jsonl.xz"], ["pendulum"], DEFAULTS, "return", "worlds.md#a-pendulum"),
     ("Atari Boxing", ATARI, ["Boxing"], DEFAULTS_OFF, "56000-76000", "atari100k.md"),
     ("Atari Breakout", ATARI, ["Breakout"], DEFAULTS_OFF, "40000-60000", "atari100k.md"),
     ("CartPole", ["cartpole.jsonl.xz"], ["CartPole-v1"], ("eqr_qrdqn", "eqr_qrdqn:off"), "until10000", "cartpole.md"),
-    ("LunarLander, dense layer", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
+    ("LunarLander", ZOO, ["LunarLander-v3"], ("eqr_qrdqn:e482329", "eqr_qrdqn:mlp"), "score", "zoo.md"),
     *(
         (f"MinAtar {game}, {agent}", MINATAR_RUNS, [game], (agent.lower(), f"{agent.lower()}:{off}"), "score", "minatar.md")
         for agent, off in OFF.items()
@@ -248,7 +249,8 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
 
 def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | None = None, axis_label: str = "") -> None:
     """
-    Draw a series along training, a panel per game: means over seeds, and their 95% intervals as a band.
+    Draw a series along training, a panel per game: means over seeds, and their 95% intervals as a band; below five seeds, their
+    range.
 
     :param what: see :func:`series`
     :param labels: of the agents, in order of appearance (default: their names)
@@ -266,11 +268,12 @@ def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | Non
                 found = [series(row, what) for row in rows if (row["agent"], row["game"]) == (agent, game)]
                 if found:
                     steps, runs = found[0][0] / 1_000, np.array([values for _, values in found])
-                    mean, width = runs.mean(axis=0), np.zeros(len(steps))
-                    if len(runs) > 1:
+                    mean, low, high = runs.mean(axis=0), runs.min(axis=0), runs.max(axis=0)
+                    if len(runs) >= 5:
                         width = student.ppf(0.975, len(runs) - 1) * runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
+                        low, high = mean - width, mean + width
                     axis.plot(steps, mean, look.marker, ls=look.line, color=look.color, label=names[agent])
-                    axis.fill_between(steps, mean - width, mean + width, color=look.color, alpha=0.15, lw=0)
+                    axis.fill_between(steps, low, high, color=look.color, alpha=0.15, lw=0)
             axis.set(title=TITLES.get(game, game), xlim=(0, None), ylim=(min(0, axis.get_ylim()[0]), None))
             axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             axis.tick_params(labelbottom=True)

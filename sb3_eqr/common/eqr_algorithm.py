@@ -118,7 +118,7 @@ class EqRAlgorithm(EqROffPolicy):
             falls below 1
         :param exploration_final_eps: final value of random action probability
         :param max_grad_norm: The maximum value for the gradient clipping (if None, no clipping), for the network with its Q
-            head and for the latent model apart
+            head and for the latent model separately
         :param prediction_depth: M, number of steps that the latent model predicts; 0 disables the auxiliary losses
         :param aet_coef: λ₂ ≥ 0, weight of the action-equivariant transition loss, a mean over steps; 0 disables it
         :param symmetry_coef: λ₃ ≥ 0, weight of the group-equivariant transition loss; 0 disables it
@@ -126,7 +126,7 @@ class EqRAlgorithm(EqROffPolicy):
         :param td_coef: weight of the TD loss, ≥ 0; 0: train only the representation, without Q-learning and with constant
             priorities
         :param aux_gradient_share: maximum norm of the auxiliary losses' gradient at the features, as a share of the TD
-            gradient's norm, ≥ 0; a larger gradient is scaled down. ``None``: no limit. Without effect if td_coef=0, and on
+            gradient's norm, ≥ 0; a larger gradient is scaled down. ``None``: no cap. Without effect if td_coef=0, and on
             the first layer of the Q head, which the AET loss trains with projection="head"
         :param double_q: whether the online network chooses the next action (van Hasselt et al. 2016)
         :param prioritized_replay: whether to sample by priority and weight all losses (Schaul et al. 2016), or uniformly
