@@ -249,8 +249,8 @@ def table(rows: list[Row], measures: list[str], baseline: str | None, is_ratio: 
 
 def draw(rows: list[Row], what: str, path: pathlib.Path, labels: list[str] | None = None, axis_label: str = "") -> None:
     """
-    Draw a series along training, a panel per game: means over seeds, and their 95% intervals as a band; below five seeds, their
-    range.
+    Draw a series along training, a panel per game: means over seeds, and as a band their 95% intervals, or, below five
+    seeds, their range.
 
     :param what: see :func:`series`
     :param labels: of the agents, in order of appearance (default: their names)
