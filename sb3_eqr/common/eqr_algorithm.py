@@ -333,8 +333,8 @@ class EqRAlgorithm(EqROffPolicy):
                 break  # the first window is not complete yet
             samples = buffer.sample(batch_size, env=self._vec_normalize_env)
             priorities, metrics = update(samples)
-            if self.target_update_interval is not None and self._resets.done[-1:] == [self._n_updates]:
-                self.policy.update_target(1.0)  # until now, after a reset, its statistics were of the old features
+            if self.target_update_interval is not None and self._resets.updates_since(self._n_updates) == 0:
+                self.policy.update_target(0.0)  # only statistics: until now zeros, or those of the features before a reset
             self._n_updates += 1
             if priorities is not None:
                 buffer.update_priorities(samples.indices, priorities)

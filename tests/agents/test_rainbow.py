@@ -195,6 +195,16 @@ def test_a_target_that_waits_is_copied_again_once_the_features_are_new(make):
     assert model._resets.done == [20] and counts_of_features(model) == ({1}, {36})
 
 
+@EITHER
+def test_a_target_that_waits_has_the_statistics_of_the_first_batch(make):
+    """Zeros would leave in its features what all observations have in common. Its parameters are the initial ones."""
+    first, model = (make(ChainEnv(), target_update_interval=1_000, seed=0) for _ in range(2))
+    model.learn(60)
+    assert counts_of_features(model) == ({1}, {model._n_updates}) and model._n_updates > 1
+    for initial, found in zip(first.policy.target.parameters(), model.policy.target.parameters(), strict=True):
+        assert th.equal(initial, found)
+
+
 def counts_of_features(model):
     """Numbers of batches in the statistics of the target's features, and of the others."""
     counts = {name: value.item() for name, value in model.policy.state_dict().items() if name.endswith("running_count")}

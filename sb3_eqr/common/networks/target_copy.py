@@ -32,7 +32,7 @@ class TargetCopy:
             if tau < 1:
                 th._foreach_mul_(target, 1 - tau)
                 th._foreach_add_(target, online, alpha=tau)
-            elif target:
+            else:
                 th._foreach_copy_(target, online)
             for count, statistic, copy in self._of_features:
                 copy.lerp_(statistic, th.where(count == 0, 1.0, tau))
