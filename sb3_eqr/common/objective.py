@@ -158,9 +158,9 @@ class Objective(LatentObjective):
         weights = online.head.with_noise(noise)  # one draw for both uses
         with th.no_grad():
             next_outputs = target.head(next_features, target.head.draw_noise())  # (B, N, A)
-            chooser, outputs = (online, online.head(for_choice, weights)) if self.double_q else (target, next_outputs)
-            next_best = of_actions(next_outputs, chooser.expectation(outputs).argmax(dim=1, keepdim=True))  # (B, N)
-            discounts = th.addcmul(samples.discounts, samples.discounts, samples.dones, value=-1)  # (B, 1): 0 at the end
+            outputs = online.head(for_choice, weights) if self.double_q else next_outputs
+            next_best = of_actions(next_outputs, online.expectation(outputs).argmax(dim=1, keepdim=True))  # (B, N)
+            discounts = samples.discounts * (1 - samples.dones)  # (B, 1): 0 at the end
         current = of_actions(online.head(features, weights), samples.actions)  # (B, N)
         loss, priorities = online.td_loss(current, next_best, samples.rewards, discounts)
         with th.no_grad():

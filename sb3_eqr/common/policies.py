@@ -74,9 +74,9 @@ class EqRPolicy(BasePolicy):
     :param sigma_init: their initial noise σ₀: 0.1 as in DER (https://arxiv.org/abs/1906.05243); Table 5 uses 0.5
     :param act_with_target: whether to choose actions with the target network, which changes more slowly if ``tau`` < 1 (as in
         SR-SPR, https://openreview.net/forum?id=OpC-9aBBVJe, and BBF), instead of the online network
-    :param bfloat16_targets: whether encoders compute in bfloat16 where no gradient flows: for the next observation of the TD
-        loss and for the rollout's observations. Saves a fifth of an Atari update's time on a CPU with avx512_bf16; the
-        features have a relative error of 0.5%. The agent warns if PyTorch finds no such instructions
+    :param bfloat16_targets: whether encoders compute in bfloat16 where no gradient flows, for targets. Saves a fifth of an
+        Atari update's time on a CPU with avx512_bf16; the features have a relative error of 0.5%. The agent warns if PyTorch
+        finds no such instructions
     :param kwargs: the options of the latent model, :class:`~sb3_eqr.common.latent.options.LatentOptions`, and additional
         arguments of the SB3 policy
     :raises ValueError: if an argument is out of range
@@ -361,4 +361,8 @@ def map_shape(encoder: BaseFeaturesExtractor) -> tuple[int, int, int]:
 def ignores_mode(module: nn.Module) -> bool:
     """Whether a module computes the same in train and in eval mode; one with buffers of its own may keep statistics."""
     depend = (nn.modules.dropout._DropoutNd, nn.RReLU)
-    return not any(isinstance(part, depend) or part._buffers for part in module.modules() if not isinstance(part, Centering))
+
+    def keeps(part: Any) -> bool:  # dropout: a number in a GRU, or in attention
+        return isinstance(part, Centering) or not (isinstance(part, depend) or part._buffers or getattr(part, "dropout", 0))
+
+    return all(map(keeps, module.modules()))

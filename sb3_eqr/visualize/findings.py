@@ -36,7 +36,7 @@ class Disentanglement(NamedTuple):
     """Whether actions, blocks and factors correspond one to one."""
 
     opposites: list[int]  # (A,): the action that undoes each action, or itself
-    specificity: np.ndarray  # (K,): 1 − H / log A of a block's motion over actions, opposites merged
+    specificity: np.ndarray  # (K,): 1 − H / log A' of a block's motion over actions, A' after merging opposites
     redundancy: np.ndarray  # (K, K): mean canonical correlation between blocks
     information: np.ndarray | None  # (K, F): of block and factor, over the factor's entropy; None if factors are unknown
     gap: np.ndarray | None  # (F,): mutual information gap

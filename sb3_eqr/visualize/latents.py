@@ -42,7 +42,7 @@ class Latents(NamedTuple):
     states: th.Tensor  # (N, D): x₀ = τ(s_t)
     next_states: th.Tensor  # (N, M, D): x₁ ... x_M, encoded
     predicted: th.Tensor  # (N, M, D): x̂₁ ... x̂_M, rolled out from x₀
-    predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m); the expected sign if the reward loss is categorical
+    predicted_rewards: th.Tensor  # (N, M): r_ψ(x̂_m), in units of rewards; the expected sign if that loss is categorical
     actions: th.Tensor  # (N, M), int64, or (N, M, action_dim) for Box actions
     rewards: th.Tensor  # (N, M)
     mask: th.Tensor  # (N, M): 1 where the episode had not ended before step t+m

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_eqr import GroupFeaturesExtractor
 from sb3_eqr.common.networks import inputs
 from sb3_eqr.common.networks.encoders import NormalizedExtractor
+from sb3_eqr.common.policies import ignores_mode
 from tests.models import EITHER, MAKERS, PAPER, loss_terms, tensors, train_on
 from tests.toys import ChainEnv, ImageEnv, SampledEnv
 
@@ -23,6 +24,17 @@ def trained_model(make, **kwargs):
     policy_kwargs = {"noisy": False, **kwargs.pop("policy_kwargs", {})}
     settings = {"tau": 0.1, "exploration_final_eps": 0.1, **kwargs}
     return make(ChainEnv(), policy_kwargs=policy_kwargs, **settings).learn(60)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+@pytest.mark.parametrize("make", [lambda p: th.nn.GRU(4, 4, 2, dropout=p), lambda p: th.nn.Sequential(th.nn.Dropout(p))])
+def test_modules_with_dropout_depend_on_the_mode(make, dropout):
+    """A target shares a trunk only if it computes the same in both modes. A GRU's dropout is a number, not a module."""
+    th.manual_seed(0)
+    module, inputs = make(dropout), th.ones(3, 4)
+    outputs = [found[0] if isinstance(found := module.train(mode)(inputs), tuple) else found for mode in (True, False)]
+    assert th.equal(*outputs) == (dropout == 0)
+    assert ignores_mode(module) <= th.equal(*outputs)
 
 
 @pytest.mark.parametrize("double_q", [True, False])

@@ -78,7 +78,7 @@ class Whitening(nn.Module):
     the covariance (Siarohin et al. 2019, https://arxiv.org/abs/1806.00420). It has no scale and offset, so features cannot
     collapse to a point. A batch of B samples gives only a noisy estimate of the covariance of D features, so the estimated
     correlations are shrunk by the fraction D / (D + B), which is therefore not removed: a feature that is determined by the
-    others keeps a variance of about this fraction instead of 1. Eval mode uses running means of the statistics.
+    others keeps a variance of about half this fraction instead of 1. Eval mode uses running means of the statistics.
 
     :param n_features: D
     :param momentum: momentum of the running means, as in PyTorch's batch norm

@@ -147,9 +147,9 @@ _SINGULAR_EPS = 10.0
 def guarded_inverse(matrix: th.Tensor) -> th.Tensor:
     """
     The inverse, or, for a matrix that is singular to machine precision, Tikhonov's damped inverse
-    (AᵀA + ε‖A‖² I)⁻¹ Aᵀ, which is always finite. Raises no exception and has no data-dependent shapes.
+    (AᵀA + ε‖A‖² I)⁻¹ Aᵀ. Raises no exception and has no data-dependent shapes.
 
-    :param matrix: square matrices, (..., n, n), finite
+    :param matrix: square matrices, (..., n, n); the result is finite if the squares of their entries are
     :return: (..., n, n)
     """
     eps = th.finfo(matrix.dtype).eps

@@ -15,13 +15,13 @@ class LatentOptions:
 
     :param group: group of the blocks of the latent state, see :func:`~sb3_eqr.common.groups.make_group`; "none" for
         unconstrained vectors, ``None`` to use the trunk's features directly (no encoder); both need ``symmetry_coef=0``
-    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the group's name contains the number of blocks
+    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 for "none" and if the group's name has the number
     :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether to whiten the encoder's algebra parameters over the batch: states cannot collapse to a point, and
         blocks are decorrelated; needs a group
     :param transition: how actions move latent states: "group", or "convolutional", SPR's network on the trunk's feature map
-        (:class:`~sb3_eqr.common.latent.conv_latent_model.ConvLatentModel`), which needs ``group=None``, an image trunk,
-        and ``layer_norm=False``, since it predicts values in [0, 1]
+        (:class:`~sb3_eqr.common.latent.conv_latent_model.ConvLatentModel`), which needs ``group=None``, ``layer_norm=False``
+        and an image trunk with ``rescale=True`` and without ``features_dim``, since it predicts values in [0, 1]
     :param latent_hidden_dim: width ≥ 1 of the hidden layers of κ, r_ψ and ρ, of b, and of ``projection="own"``; 256 in
         appendix B.4
     :param latent_norm: norm of the hidden layers of κ(x, a), r_ψ and ρ: "layer", or "batch" (appendix B.4), with which an

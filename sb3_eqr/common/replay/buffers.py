@@ -223,13 +223,14 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def _windows(self, positions: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SequenceReplayBufferSamples:
         """The windows of environments ``envs``, (B,), that start at ``positions``, (B,)."""
-        columns, steps = envs[:, None], np.arange(max(self.n_steps, self.prediction_depth))
-        window = (positions[:, None] + steps) % self.buffer_size  # (B, W)
+        columns = envs[:, None]
+        window = (positions[:, None] + np.arange(self.window)) % self.buffer_size  # (B, W)
         # The newest transition ends a window, because the oldest data follow the write position.
         is_end = (self.dones[window, columns] + self.timeouts[window, columns] > 0) | (
             window == (self.pos - 1) % self.buffer_size
         )
-        first_end = np.where(is_end.any(axis=1), is_end.argmax(axis=1), len(steps) - 1)  # (B,)
+        is_end[:, -1] = True
+        first_end = is_end.argmax(axis=1)  # (B,)
         rewards = self._normalize_reward(self.rewards[window, columns], env)  # (B, W)
         samples = self._transitions(positions, envs, first_end, rewards, env)
         if self.prediction_depth == 0:
@@ -245,7 +246,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         included = np.arange(n) <= last_step[:, None]  # (B, n)
         powers = self.gamma ** np.arange(n, dtype=np.float32)
         returns = (rewards[:, :n] * powers * included).sum(axis=1, keepdims=True)  # (B, 1)
-        discounts = self.gamma ** included.sum(axis=1, keepdims=True).astype(np.float32)  # (B, 1)
+        discounts = self.gamma ** (last_step[:, None] + 1).astype(np.float32)  # (B, 1)
         last = (positions + last_step) % self.buffer_size
         dones = (self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None]  # (B, 1)
         return SequenceReplayBufferSamples(
