@@ -6,30 +6,37 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_eqr.common.actor_critic_policies import EqRActorCriticPolicy
 from sb3_eqr.common.checks import validation
-from sb3_eqr.common.checks.arguments import ALGORITHM, NONE, Rule, check_arguments, integer, number, one_of, plain
+from sb3_eqr.common.checks.arguments import ALGORITHM, FLAG, NONE, Rule, a, check_arguments, integer, number, one_of, plain
 from sb3_eqr.common.checks.update_monitor import UpdateMonitor
 from sb3_eqr.common.objective import LatentObjective
 from sb3_eqr.common.off_policy import EqROffPolicy, keep_freed_memory
 from sb3_eqr.common.replay.buffers import PrioritizedSequenceReplayBuffer, SequenceReplayBuffer
+from sb3_eqr.common.saving.random_state import preserved_rng_state
 from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 
 def is_entropy_coefficient(value: Any) -> bool:
-    """As SB3's SAC reads it: a number, also as text, or "auto", also with an initial value."""
+    """As SB3's SAC reads it: a number, also as text, or "auto", also with an initial value above 0."""
+    first, is_auto, start = str(value).partition("auto_")
     try:
-        return 0 <= float(str(value).removeprefix("auto_")) < np.inf
-    except ValueError:
+        return 0 < float(start) < np.inf and not first and "_" not in start if is_auto else 0 <= float(value) < np.inf
+    except (ValueError, TypeError):
         return value == "auto"
 
 
 RULES = {
     **ALGORITHM,
-    "ent_coef": Rule('a number >= 0, "auto", or "auto_" with a number', is_entropy_coefficient),
+    "ent_coef": Rule('a number >= 0, "auto", or "auto_" with a number > 0', is_entropy_coefficient),
+    "action_noise": a(ActionNoise, "an action noise of SB3") | NONE,
+    "use_sde": FLAG,
+    "sde_sample_freq": integer(-1),
+    "use_sde_at_warmup": FLAG,
     "target_entropy": number() | one_of(["auto"]),
     "learning_starts": integer(0),
     "latent_batch_size": integer(2) | NONE,
@@ -72,6 +79,8 @@ class EqRActorCritic(EqROffPolicy):
         validation.check_device(kwargs["device"])
         validation.warn_of_memory_option(kwargs.pop("optimize_memory_usage"))
         policy_kwargs = dict(policy_kwargs or {})  # a copy, because SB3 changes it
+        if "use_sde" in policy_kwargs:
+            raise TypeError("policy_kwargs: 'use_sde' is an argument of the agent. Pass use_sde=... beside policy_kwargs.")
         kwargs = {name: plain(value) for name, value in kwargs.items()}
         super().__init__(policy, env, policy_kwargs=policy_kwargs, **kwargs, _init_setup_model=False)  # type: ignore[call-arg]
         self.prediction_depth = prediction_depth
@@ -87,6 +96,19 @@ class EqRActorCritic(EqROffPolicy):
         if issubclass(self.replay_buffer_class or SequenceReplayBuffer, PrioritizedSequenceReplayBuffer):
             name = type(self).__name__
             raise ValueError(f"replay_buffer_class must sample uniformly, because {name} computes no priorities.")
+
+    def _check_attributes(self) -> None:
+        super()._check_attributes()
+        with preserved_rng_state(self.action_space):
+            validation.check_noise(self.action_noise, self.action_space.shape)
+        agent: Any = self
+        made = {"use_sde": agent.actor.use_sde, "ent_coef": agent.ent_coef_optimizer is not None}
+        found = {"use_sde": agent.use_sde, "ent_coef": str(agent.ent_coef).startswith("auto")}
+        for name in (name for name in made if made[name] != found[name]):
+            raise ValueError(
+                f"{name} must be of the same kind as when the agent was made, got {getattr(self, name)!r}. "
+                "Pass it to the constructor of a new agent."
+            )
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         self._check_attributes()

@@ -22,6 +22,7 @@ from sb3_eqr.common.checks.arguments import (
     TEXT,
     Rule,
     a,
+    a_list,
     check_arguments,
     integer,
     number,
@@ -49,13 +50,17 @@ from sb3_eqr.common.type_aliases import PyTorchObs
 
 DEFAULT_SHIFT = 4  # pixels, as in DrQ
 GROUP = TEXT | a(Group, "a group")
+WIDTHS = a_list(integer(1))
 NET_ARCH = Rule(
-    'a dictionary with the lists "pi" and "qf"', lambda value: isinstance(value, dict) and {*value} == {"pi", "qf"}
+    'a dictionary with the lists "pi" and "qf"',
+    lambda value: isinstance(value, dict) and {*value} == {"pi", "qf"} and all(map(WIDTHS.holds, value.values())),
 )
 RULES = {
     **POLICY,
     "net_arch": POLICY["net_arch"] | NET_ARCH,
     "n_critics": integer(1),
+    "log_std_init": number(),
+    "clip_mean": number(0, above=True),
     "head_input": one_of(["latent", "observation"]),
     "reads_features": FLAG | NONE,
     "shift_pixels": ALGORITHM["shift_pixels"],
@@ -220,8 +225,8 @@ class EqRActorCriticPolicy(BasePolicy):
     :param reads_features: whether actor and critics read h(s) beside x and what of s is not an image; ``None``: only if s
         has images
     :param head_input: what actor and critics read: "latent", or "observation", as in SB3, without a latent model
-    :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, as in DrQ
-        (https://arxiv.org/abs/2004.13649)
+    :param shift_pixels: largest random shift of images in updates, in pixels, ≥ 0, at most one for each 16 of the smaller
+        side, as in DrQ (https://arxiv.org/abs/2004.13649)
     :param kwargs: the options of the latent model, :class:`ActorCriticOptions`, and the other arguments of the SB3 policy
     :raises ValueError: if an argument is out of range
     """

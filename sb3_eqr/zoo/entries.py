@@ -24,6 +24,7 @@ from sb3_eqr.common.checks.arguments import (
     integer,
     nearest,
     number,
+    one_of,
     parameters_of,
 )
 from sb3_eqr.common.off_policy import EqROffPolicy
@@ -47,6 +48,7 @@ RULES = {
     "buffer_size": number(1),
     "normalize": FLAG | TEXT | DICTIONARY,
     # RL Zoo converts "lin_1e-3" to a schedule that decreases linearly to 0.
+    "noise_type": one_of(["normal", "ornstein-uhlenbeck"]) | NONE,
     "learning_rate": number(0) | Rule("lin_ and a number", lambda value: number_in(value, "lin_") >= 0),
 }
 
@@ -183,6 +185,8 @@ def check_values(entry: dict[str, Any], source: str) -> None:
     for key, rule in RULES.items():
         if key in entry and not rule.holds(entry[key]):
             fail(f"{source}: {key} must be {rule.says}, got {entry[key]!r}.")
+    if entry.get("noise_type") and "noise_std" not in entry:
+        fail(f"{source}: noise_type needs noise_std, got none. Add noise_std: 0.1, or leave noise_type out.")
 
 
 def check_wrappers(entry: dict[str, Any], name: str, source: str) -> None:

@@ -490,7 +490,13 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"replay_buffer_class": PrioritizedSequenceReplayBuffer}, "must sample uniformly"),
         ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
         ({"latent_batch_size": 1}, "latent_batch_size must be an integer >= 2 or None, got 1"),
-        ({"ent_coef": "aut"}, 'ent_coef must be a number >= 0, "auto", or "auto_" with a number, got .aut.'),
+        ({"ent_coef": "aut"}, 'ent_coef must be a number >= 0, "auto", or "auto_" with a number > 0, got .aut.'),
+        ({"ent_coef": "auto_1_2"}, "ent_coef must be .*, got .auto_1_2"),
+        ({"ent_coef": "auto_0"}, "ent_coef must be .*, got .auto_0"),
+        ({"action_noise": 3}, "action_noise must be an action noise of SB3 or None, got 3"),
+        ({"use_sde": "yes"}, "use_sde must be True or False, got .yes"),
+        ({"sde_sample_freq": "a"}, "sde_sample_freq must be an integer >= -1, got .a"),
+        ({"policy_kwargs": {"use_sde": True}}, "Pass use_sde=... beside policy_kwargs"),
         ({"target_entropy": "aut"}, "target_entropy must be a finite number or one of .'auto'., got 'aut'"),
         ({"aet_coef": -1.0}, "aet_coef must be a finite number >= 0, got -1.0"),
         ({"aet_coeff": 1.0}, "Did you mean 'aet_coef'"),
@@ -504,6 +510,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"policy_kwargs": {"optimizer_kwargs": 3}}, "optimizer_kwargs must be a dictionary"),
         ({"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn must be a class of torch.nn"),
         ({"policy_kwargs": {"net_arch": [0]}}, "net_arch must be a list of integers"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": ["a"]}}}, "net_arch must be a list of integers"),
         ({"policy_kwargs": {"transition": "convolutional"}}, "transition must be one of"),
         ({"replay_buffer_kwargs": {"handle_timeouts": True}}, "unexpected argument 'handle_timeouts'"),
         ({"n_blocks": 3}, "Pass policy_kwargs=dict\\(n_blocks=...\\)"),
@@ -513,6 +520,37 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
 def test_wrong_arguments_fail_before_the_first_step(agent, kwargs, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make(agent, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (
+            {"action_noise": NormalActionNoise(np.zeros(3), np.ones(3))},
+            r"must have the shape of an action, \(2,\), .*got Norm",
+        ),
+        ({"action_noise": NormalActionNoise(np.zeros(2), np.full(2, np.nan))}, "action_noise must .* be finite, got Normal"),
+        ({"ent_coef": 0.1}, "ent_coef must be of the same kind as when the agent was made, got 0.1"),
+        ({"use_sde": True}, "use_sde must be of the same kind as when the agent was made, got True"),
+    ],
+)
+@EACH
+def test_attributes_that_do_not_fit_the_agent_fail_before_the_first_step(agent, changes, message):
+    model = make(agent)
+    for name, value in changes.items():
+        setattr(model, name, value)
+    with pytest.raises(ValueError, match=message):
+        model.learn(1)
+    assert model.num_timesteps == 0
+
+
+@EACH
+def test_a_component_of_actions_that_cannot_change_is_refused(agent):
+    """SB3 scales actions by the range of each component."""
+    env = MoveEnv()
+    env.action_space = spaces.Box(np.array([-1, 1], np.float32), np.array([1, 1], np.float32))
+    with pytest.raises(ValueError, match="action_space must have components with low < high only, got Box"):
+        make(agent, env)
 
 
 @EACH

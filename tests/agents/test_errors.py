@@ -72,6 +72,8 @@ OUTSIDE = r"Use VecNormalize\(VecTransposeImage\(env\), norm_obs=False\)"
         (lambda: SampledEnv(spaces.MultiDiscrete([5, 2], start=[0, 1])), {}, "observation_space must start at 0"),
         (lambda: SampledEnv(spaces.MultiDiscrete([[5, 2], [2, 2]])), {}, "must be a MultiDiscrete of one dimension"),
         (lambda: SampledEnv(spaces.Box(-1, 1, ())), {}, "observation_space must have at least one axis"),
+        (lambda: SampledEnv(spaces.Box(-1, 1, (0,))), {}, "observation_space must not be empty, got Box"),
+        (lambda: SampledEnv(spaces.Dict()), DICT, r"observation_space must not be empty, got Dict\(\)"),
         (lambda: SampledEnv(spaces.Dict({"a": spaces.Box(-1, 1, ())})), DICT, r"\['a'\] must have at least one axis"),
         (lambda: make_vec_env(ChainEnv, 4), {"buffer_size": 23}, "buffer_size=24"),
         (ChainEnv, IMAGES, "MlpPolicy for vectors"),

@@ -1,5 +1,6 @@
 """Checks as pure functions: each does nothing, or raises an error that states what is legal, what was given and what to do."""
 
+import copy
 import inspect
 import pathlib
 import traceback
@@ -149,18 +150,28 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 
 def check_continuous_actions(action_space: spaces.Space) -> None:
-    """Raise AssertionError, as SB3 does, if the action space is not a Box."""
+    """Raise AssertionError, as SB3 does, if the action space is not a Box, ValueError if a component cannot change."""
     if not isinstance(action_space, spaces.Box):
         raise AssertionError(
             f"The algorithm only supports {spaces.Box} as action space, but {action_space} was provided. "
             "Use EqRQRDQN or EqRRainbow for a Discrete one; no agent has MultiDiscrete or MultiBinary actions."
         )
+    if not (action_space.low < action_space.high).all() or 0 in action_space.shape:
+        raise ValueError(f"action_space must have components with low < high only, got {action_space}. Leave the others out.")
+
+
+def check_noise(noise: Any, shape: Any) -> None:
+    """Raise ValueError if a noise is not one number for each component of an action. Draws from NumPy's global generator."""
+    if noise is not None:
+        drawn = np.asarray(copy.deepcopy(getattr(noise, "base_noise", noise))())
+        if drawn.shape not in ((), (1,), shape) or not np.isfinite(drawn).all():
+            raise ValueError(f"action_noise must have the shape of an action, {shape}, and be finite, got {noise!r}.")
 
 
 def check_observation_space(observation_space: spaces.Space, name: str = "observation_space") -> None:
     """
-    Raise ValueError if it, or a space in a dict, is of a kind without a fixed shape, has no axis, or is Discrete or
-    MultiDiscrete and does not start at 0, or MultiDiscrete with several axes.
+    Raise ValueError if it, or a space in a dict, is of a kind without a fixed shape, is empty, has no axis, or is
+    Discrete or MultiDiscrete and does not start at 0, or MultiDiscrete with several axes.
     """
     if isinstance(observation_space, spaces.Dict) and name == "observation_space":
         for key, space in observation_space.spaces.items():
@@ -178,6 +189,8 @@ def check_observation_space(observation_space: spaces.Space, name: str = "observ
             f"{name} must start at 0, because SB3 encodes it as one-hot, got {observation_space}. "
             "Wrap the environment with gymnasium.wrappers.TransformObservation."
         )
+    if 0 in (observation_space.shape or ()) or observation_space == spaces.Dict():
+        raise ValueError(f"{name} must not be empty, got {observation_space}.")
     if isinstance(observation_space, spaces.Box) and observation_space.shape == ():
         raise ValueError(
             f"{name} must have at least one axis, got {observation_space}. "
