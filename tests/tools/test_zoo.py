@@ -64,6 +64,8 @@ from tests.toys import ChainEnv, DictEnv, ImageEnv
         ("train --algo eqr_qrdqn -params policy_kwargs:dict(aet_coef=1)", "'aet_coef' is not .* Put it beside policy_kwargs"),
         ("train --algo eqr_qrdqn -params env_wrapper:'gymnasium.wrappers.Nope'", "env_wrapper must name .* attribute 'Nope'"),
         ("train --algo eqr_qrdqn -params env_wrapper:'Nope'", "env_wrapper must name .* got 'Nope'"),
+        ("train --algo eqr_sac --env Pendulum-v1 -params noise_type:'white'", "noise_type must be one of .*, got 'white'"),
+        ("train --algo eqr_sac --env Pendulum-v1 -params noise_type:'normal'", "noise_type needs noise_std, got none"),
         ("train --algo eqr_qrdqn -optimize --checkpoint-every 9", "are for single runs, got a search"),
         ("train --algo ppo --resume nowhere", "--algo must be eqr_qrdqn or eqr_rainbow .*, got ppo"),
         ("train --algo eqr_qrdqn --resume nowhere", "nowhere must be a checkpoint .*, got nothing"),
