@@ -47,8 +47,13 @@ AXES = {
     "return": "mean return in training",
     "goals": "goals reached per tenth of the run",
 }
-TITLES = {"torus_of_4": "torus, 4 distractors", "torus_of_8": "torus, 8 distractors", "pendulum": "PixelPendulum-v0"}
-TITLES |= {"UpNDown": "Up N Down", "MsPacman": "Ms Pacman"}
+TITLES = {
+    "torus_of_4": "torus, 4 distractors",
+    "torus_of_8": "torus, 8 distractors",
+    "pendulum": "PixelPendulum-v0",
+    "UpNDown": "Up N Down",
+    "MsPacman": "Ms Pacman",
+}
 VERDICTS = {  # colour and marker of each
     "better with EqR": (COLORS[0], "^"),
     "no clear difference": (GREY, "o"),

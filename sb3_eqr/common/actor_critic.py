@@ -23,10 +23,11 @@ from sb3_eqr.common.type_aliases import SequenceReplayBufferSamples
 
 def is_entropy_coefficient(value: Any) -> bool:
     """As SB3's SAC reads it: a number, also as text, or "auto", also with an initial value above 0."""
-    first, is_auto, start = str(value).partition("auto_")
+    text = str(value)
+    start = text.removeprefix("auto_")
     try:
-        return 0 < float(start) < np.inf and not first and "_" not in start if is_auto else 0 <= float(value) < np.inf
-    except (ValueError, TypeError):
+        return 0 <= float(start) < np.inf and (start == text or (float(start) > 0 and "_" not in start))
+    except ValueError:
         return value == "auto"
 
 

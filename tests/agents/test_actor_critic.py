@@ -491,6 +491,7 @@ def test_checkpoints_of_another_run_are_refused(agent, tmp_path):
         ({"replay_buffer_kwargs": {"n_steps": 3}}, "Pass n_steps=3 to EqR"),
         ({"latent_batch_size": 1}, "latent_batch_size must be an integer >= 2 or None, got 1"),
         ({"ent_coef": "aut"}, 'ent_coef must be a number >= 0, "auto", or "auto_" with a number > 0, got .aut.'),
+        ({"ent_coef": True}, "ent_coef must be .*, got True"),
         ({"ent_coef": "auto_1_2"}, "ent_coef must be .*, got .auto_1_2"),
         ({"ent_coef": "auto_0"}, "ent_coef must be .*, got .auto_0"),
         ({"action_noise": 3}, "action_noise must be an action noise of SB3 or None, got 3"),
