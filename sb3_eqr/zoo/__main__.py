@@ -255,8 +255,9 @@ def prepare(command: str, arguments: list[str]) -> list[str]:
     if args.algo not in ALGOS:
         fail(f"--algo must be one of {', '.join(ALGOS)}, got {args.algo!r}.{nearest(args.algo, ALGOS)}")
     if command == "train":
+        resuming = prepare_resuming(args)  # before settings beside --resume are read
+        arguments = [*own.parse_known_args(arguments)[1], *resuming]
         path = prepare_training(args)
-        arguments = [*own.parse_known_args(arguments)[1], *prepare_resuming(args)]
         arguments = arguments if path == args.conf_file else [*arguments, "--conf-file", str(path)]  # the last one counts
     elif command in LOADING:
         check_device(args.device)

@@ -80,6 +80,17 @@ def test_wrong_use_prints_an_error(sb3_eqr, line, message):
     assert re.search(message, sb3_eqr(line, code=2).err)
 
 
+def test_no_settings_are_read_beside_what_is_no_checkpoint(sb3_eqr, tmp_path):
+    """Those of another folder, even with ``--trust``, which would run their code."""
+    ran, other = tmp_path / "ran", tmp_path / "other"
+    other.mkdir()
+    for name in ("config.yml", "args.yml"):
+        (other / name).write_text(f"!!python/object/apply:os.makedirs [{ran}, 511, true]")
+    line = f"train --algo eqr_qrdqn --resume {tmp_path / 'nowhere'} --trust"
+    assert "must be a checkpoint" in sb3_eqr(line, code=2).err
+    assert not ran.exists()
+
+
 @pytest.mark.parametrize(
     "package, line, advice",
     [
