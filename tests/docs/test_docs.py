@@ -371,7 +371,6 @@ STORY = [  # lines of the pages in a working order, and arguments that shorten t
         "python examples/blind_cliffwalk.py --seeds 10 --json docs/results/cliffwalk.json",
         "--seeds 1 --states 2 --json cliffwalk.json",
     ),
-    ("python examples/random_play.py", "--episodes 2"),
 ]
 
 
