@@ -349,6 +349,7 @@ def main() -> None:
     reporting.add_argument("--figure", type=pathlib.Path, help="also draw the returns of --drawn and sac into this file")
     reporting.add_argument("--drawn", default="eqr_sac", help="an arm of EqRSAC")
     reporting.add_argument("--to", default="sac", help="the arm whose area is 1")
+    reporting.add_argument("--seeds", nargs="+", type=int, help="only these, of all arms")
     reporting.add_argument("--after", type=int, default=0, help="count episodes that end after this step")
     reporting.add_argument("--until", type=int, default=N_STEPS, help="count episodes that end until this step")
     reporting.add_argument(
@@ -372,9 +373,11 @@ def main() -> None:
         lines = [json.dumps(run) + "\n" for key in sorted(runs) for _, run in sorted(runs[key].items())]
         with atomic_write(args.pack, "xz") as out:
             out.write(lzma.compress("".join(lines).encode()))
+    if args.seeds is not None:
+        runs = {key: {seed: run for seed, run in found.items() if seed in args.seeds} for key, found in runs.items()}
     if args.greedy:  # older runs were not evaluated
         runs = {key: {seed: run for seed, run in found.items() if "greedy" in run} for key, found in runs.items()}
-        runs = {key: found for key, found in runs.items() if found}
+    runs = {key: found for key, found in runs.items() if found}
     if args.to not in (arms := sorted({arm for _, arm in runs})):
         parser.error(f"--to must be one of {arms}, got {args.to!r}")
     if args.figure is not None:
