@@ -1,8 +1,10 @@
 """Register the agents with RL Zoo, and the search space of ``-optimize``."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from optuna.trial import FixedTrial
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
@@ -15,29 +17,6 @@ LATENT_SPACE: dict[str, list[Any]] = {
     "group": ["SE(2)", "SO(3)", "GL(2)", "T(72)^1"],
 }
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "one": [256]}
-
-
-def convert_eqr_params(sampled: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled: values by the names of :func:`sample_eqr_params`
-    :param kept: ``policy_kwargs`` that are not searched, which RL Zoo would drop
-    :return: keyword arguments of the agent
-    """
-    params = dict(sampled)
-    batch_size, train_freq = 2 ** params.pop("batch_size_pow"), 2 ** params.pop("train_freq_pow")
-    policy_kwargs = {**kept, **{name: params.pop(name) for name in ("group", "n_blocks", "net_arch", "noisy")}}
-    policy_kwargs["net_arch"] = NET_ARCHS[policy_kwargs["net_arch"]]
-    if "return_range" in params:
-        policy_kwargs["v_max"] = float(params.pop("return_range"))
-        policy_kwargs["v_min"] = -policy_kwargs["v_max"]
-    return {
-        "gamma": 1 - params.pop("one_minus_gamma"),
-        "batch_size": batch_size,
-        "train_freq": train_freq,
-        "gradient_steps": max(round(train_freq * params.pop("replay_ratio")), 1),
-        **params,
-        "policy_kwargs": policy_kwargs,
-    }
 
 
 def sample_eqr_params(
@@ -71,7 +50,20 @@ def sample_eqr_params(
     }
     if categorical:
         sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 200, 400])
-    return convert_eqr_params(sampled, kept)
+    batch_size, train_freq = 2 ** sampled.pop("batch_size_pow"), 2 ** sampled.pop("train_freq_pow")
+    policy_kwargs = {**kept, **{name: sampled.pop(name) for name in ("group", "n_blocks", "net_arch", "noisy")}}
+    policy_kwargs["net_arch"] = NET_ARCHS[policy_kwargs["net_arch"]]
+    if categorical:
+        policy_kwargs["v_max"] = float(sampled.pop("return_range"))
+        policy_kwargs["v_min"] = -policy_kwargs["v_max"]
+    return {
+        "gamma": 1 - sampled.pop("one_minus_gamma"),
+        "batch_size": batch_size,
+        "train_freq": train_freq,
+        "gradient_steps": max(round(train_freq * sampled.pop("replay_ratio")), 1),
+        **sampled,
+        "policy_kwargs": policy_kwargs,
+    }
 
 
 def sample_actor_critic_params(
@@ -80,22 +72,15 @@ def sample_actor_critic_params(
     """Sample as RL Zoo does for the ``stock`` algorithm, and the latent model's group, depth and coefficients."""
     found = HYPERPARAMS_SAMPLER[stock](trial, n_actions, n_envs, additional_args)
     own = {name: trial.suggest_categorical(name, values) for name, values in LATENT_SPACE.items()}
-    return with_latent_params(found, own, kept)
-
-
-def convert_actor_critic_params(sampled: dict[str, Any], stock: str, kept: dict[str, Any]) -> dict[str, Any]:
-    """As :func:`convert_eqr_params`, by the names of :func:`sample_actor_critic_params`."""
-    own = {name: sampled[name] for name in LATENT_SPACE}
-    found = HYPERPARAMS_CONVERTER[stock]({name: value for name, value in sampled.items() if name not in own})
-    return with_latent_params(found, own, kept)
-
-
-def with_latent_params(stock: dict[str, Any], own: dict[str, Any], kept: dict[str, Any]) -> dict[str, Any]:
-    """Keyword arguments of the stock algorithm and of the latent model together."""
-    policy_kwargs = {**kept, **stock["policy_kwargs"], "group": own["group"]}
-    if "^" in own["group"]:  # which has its number of blocks
+    policy_kwargs = {**kept, **found["policy_kwargs"], "group": own.pop("group")}
+    if "^" in policy_kwargs["group"]:  # which has its number of blocks
         policy_kwargs.pop("n_blocks", None)
-    return {**stock, **{name: value for name, value in own.items() if name != "group"}, "policy_kwargs": policy_kwargs}
+    return {**found, **own, "policy_kwargs": policy_kwargs}
+
+
+def convert(sampled: dict[str, Any], sampler: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+    """The keyword arguments that ``sampler`` returned for the trial whose parameters are ``sampled``."""
+    return sampler(FixedTrial(sampled), 1, 1, {"using_her_replay_buffer": False})
 
 
 def register(policy_kwargs: dict[str, Any] | None = None) -> None:
@@ -106,14 +91,12 @@ def register(policy_kwargs: dict[str, Any] | None = None) -> None:
     """
     ALGOS.update(AGENTS)  # type: ignore[arg-type]
     kept = policy_kwargs or {}
-    for name in DISCRETE:
-        sampler = partial(sample_eqr_params, categorical=name == "eqr_rainbow", kept=kept)
-        HYPERPARAMS_SAMPLER[name] = sampler  # type: ignore[assignment]
-        HYPERPARAMS_CONVERTER[name] = partial(convert_eqr_params, kept=kept)  # type: ignore[assignment]
+    samplers = {name: partial(sample_eqr_params, categorical=name == "eqr_rainbow", kept=kept) for name in DISCRETE}
     for name in CONTINUOUS:
-        stock = name.removeprefix("eqr_")
-        HYPERPARAMS_SAMPLER[name] = partial(sample_actor_critic_params, stock=stock, kept=kept)  # type: ignore[assignment]
-        HYPERPARAMS_CONVERTER[name] = partial(convert_actor_critic_params, stock=stock, kept=kept)  # type: ignore[assignment]
+        samplers[name] = partial(sample_actor_critic_params, stock=name.removeprefix("eqr_"), kept=kept)
+    for name, sampler in samplers.items():
+        HYPERPARAMS_SAMPLER[name] = sampler  # type: ignore[assignment]
+        HYPERPARAMS_CONVERTER[name] = partial(convert, sampler=sampler)  # type: ignore[assignment]
 
 
 def trust_files(algo: str) -> None:
