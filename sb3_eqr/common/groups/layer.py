@@ -11,7 +11,7 @@ from sb3_eqr.common.groups.product import ProductGroup, make_group
 
 DEFAULT_GROUP = "SE(2)"  # §7 and Table 5
 DEFAULT_N_BLOCKS = 12  # Table 5, for SE(2) and GL(2)
-DEFAULT_N_TRANSLATIONS = 32  # Table 5, for T(2)
+DEFAULT_N_TRANSLATED = 64  # Table 5: 32 blocks of T(2)
 
 
 class GroupLayer(nn.Module):
@@ -20,8 +20,8 @@ class GroupLayer(nn.Module):
 
     :param features_dim: F
     :param group: see :func:`~sb3_eqr.common.groups.make_group`
-    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 if the name contains the number of blocks
-        ("SE(2)^8 x SO(3)^4"), which K multiplies, or is "none"
+    :param n_blocks: K ≥ 1; ``None``: 12 (Table 5), or for T(n) as many as make 64 numbers, at least one (32 of T(2), Table 5),
+        or 1 if the name contains the number of blocks ("SE(2)^8 x SO(3)^4"), which K multiplies, or is "none"
     :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether to whiten the algebra parameters over the batch
         (:class:`~sb3_eqr.common.groups.layer.Whitening`): states cannot collapse to a point, and blocks are decorrelated
@@ -42,7 +42,7 @@ class GroupLayer(nn.Module):
             made, count = made.factors[0]
             n_blocks = count * (n_blocks or 1)
         if n_blocks is None:
-            n_blocks = DEFAULT_N_TRANSLATIONS if isinstance(made, T) else DEFAULT_N_BLOCKS
+            n_blocks = max(DEFAULT_N_TRANSLATED // made.num_params, 1) if isinstance(made, T) else DEFAULT_N_BLOCKS
             n_blocks = 1 if isinstance(made, (ProductGroup, NoGroup)) else n_blocks
         if n_blocks < 1:
             raise ValueError(f"n_blocks must be an integer >= 1, got {n_blocks!r}.")

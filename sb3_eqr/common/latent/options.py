@@ -15,7 +15,7 @@ class LatentOptions:
 
     :param group: group of the blocks of the latent state, see :func:`~sb3_eqr.common.groups.make_group`; "none" for
         unconstrained vectors, ``None`` to use the trunk's features directly (no encoder); both need ``symmetry_coef=0``
-    :param n_blocks: K ≥ 1; ``None``: 12, or 32 for T(n) (Table 5), or 1 for "none" and if the group's name has the number
+    :param n_blocks: K ≥ 1; ``None``: as in :class:`~sb3_eqr.common.groups.layer.GroupLayer`, 12 for SE(2) (Table 5)
     :param parameterization: parameterization of rotations, "euler", "exp" or "gram-schmidt"
     :param whiten: whether to whiten the encoder's algebra parameters over the batch: states cannot collapse to a point, and
         blocks are decorrelated; needs a group
