@@ -26,30 +26,18 @@ def test_several_atari_runs_are_stopped_packed_and_finished(tmp_path):
     """The command of docs/gpu.md, with shorter games and without a GPU."""
     suite = yaml.safe_load(OWN_SUITES.read_text())["atari100k"]
     suite |= {
-        "steps": 2_030,
+        "steps": 330,
         "evaluation": suite["evaluation"] | {"n_envs": 2, "max_steps": 40, "curve": {"points": 1, "episodes": 1}},
     }
     (tmp_path / "suites.yml").write_text(yaml.safe_dump({"short": suite}))
     agents = [f"eqr_rainbow:{SETTINGS / name}.yml" for name in ("slow_target", "slow_target_eqr")]
-    line = [
-        "benchmark",
-        "run",
-        "gpu",
-        "--suite",
-        "short",
-        "--suite-file",
-        "suites.yml",
-        "--games",
-        "Boxing",
-        "--agents",
-        *agents,
-    ]
-    line += ["--seeds", 1, "--device", "cpu", "--jobs", 2, "--episodes", 2]
+    line = [*"benchmark run gpu --suite short --suite-file suites.yml --games Boxing --agents".split(), *agents]
+    line += "--seeds 1 --device cpu --jobs 2 --episodes 2".split()
     assert "2 of 2 runs are left" in call(tmp_path, *line, "--stop-after", 2)
     assert "2 runs in rows.jsonl.xz" in call(tmp_path, "benchmark", "pack", "gpu", "rows.jsonl.xz")
     rows = read(tmp_path / "rows.jsonl.xz")[1]
     assert [row["agent"] for row in rows] == ["eqr_rainbow:slow_target", "eqr_rainbow:slow_target_eqr"]
-    assert all(row["stopped_at"] < 2_030 and row["machine"]["updates"] == "eager" for row in rows)
+    assert all(row["stopped_at"] < 330 and row["machine"]["updates"] == "eager" for row in rows)
     assert "All runs are finished" in call(tmp_path, *line)
     call(tmp_path, "benchmark", "pack", "gpu", "rows.jsonl.xz")
     for row in read(tmp_path / "rows.jsonl.xz")[1]:
