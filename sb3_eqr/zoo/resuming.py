@@ -128,9 +128,9 @@ class ResumableExperiment(ExperimentManager):
         model = ALGOS[self.algo].resume(checkpoints, env, self.device, self.trust)  # type: ignore[attr-defined]
         if self.n_timesteps <= model.num_timesteps:
             fail(f"--resume: {self.resume} is already at step {model.num_timesteps}. Pass -n above {model.num_timesteps}.")
-        for run in (checkpoints.parent, checkpoints.parent.parent):
-            if (best := run / BEST).is_file():  # which a worse one will not replace
-                shutil.copy2(best, self.save_path)
+        run = run_of(self.resume)
+        if run is not None and (run / BEST).is_file():  # which a worse one will not replace
+            shutil.copy2(run / BEST, self.save_path)
         print(f"Resuming at step {model.num_timesteps}")
         self.n_timesteps -= model.num_timesteps
         model.verbose, model.tensorboard_log = self.verbose, self.tensorboard_log or model.tensorboard_log
@@ -157,6 +157,12 @@ def checkpoints_of(path: pathlib.Path) -> pathlib.Path:
     return path / FOLDER if (path / FOLDER).is_dir() else path
 
 
+def run_of(path: pathlib.Path) -> pathlib.Path | None:
+    """The folder of the run that wrote these checkpoints, or this one; ``None`` if they are not in such a folder."""
+    checkpoints = checkpoints_of(path).resolve()
+    return next((folder.parent for folder in (checkpoints, checkpoints.parent) if folder.name == FOLDER), None)
+
+
 def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> dict[str, Any] | None:
     """
     :param path: a run's folder, a folder of checkpoints, or one checkpoint
@@ -165,15 +171,15 @@ def config_of(path: pathlib.Path, trust: bool, packages: Sequence[str] = ()) -> 
     :return: the entry of the run that wrote it, from RL Zoo's config.yml and args.yml; ``None`` if they are not there
     :raises ValueError: if they name code of other packages
     """
-    path = path.resolve()
-    for run in (path, path.parent, path.parent.parent):
-        for config in sorted(run.glob("*/config.yml")):
-            if not trust:
-                check_zoo_folder(config.parent, packages)
-            if not (config.parent / "args.yml").is_file():
-                raise ValueError(f"{config.parent} must have args.yml beside config.yml, as RL Zoo writes it, got none.")
-            read = read_trusted if trust else read_plain
-            entry, arguments = read(config), read(config.parent / "args.yml")
-            given = {name: arguments.get(name) for name in ("env_kwargs", "n_timesteps")}
-            return {**entry, **{name: value for name, value in given.items() if value not in (None, {}, -1)}}
-    return None
+    run = run_of(path)
+    config = None if run is None else next(iter(sorted(run.glob("*/config.yml"))), None)
+    if config is None:
+        return None
+    if not trust:
+        check_zoo_folder(config.parent, packages)
+    if not (config.parent / "args.yml").is_file():
+        raise ValueError(f"{config.parent} must have args.yml beside config.yml, as RL Zoo writes it, got none.")
+    read = read_trusted if trust else read_plain
+    entry, arguments = read(config), read(config.parent / "args.yml")
+    given = {name: arguments.get(name) for name in ("env_kwargs", "n_timesteps")}
+    return {**entry, **{name: value for name, value in given.items() if value not in (None, {}, -1)}}

@@ -221,6 +221,24 @@ def test_other_agents_can_be_trained(sb3_eqr, tmp_path):
     assert (tmp_path / "ppo_lstm" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
 
 
+def test_only_the_settings_of_the_run_that_wrote_the_checkpoints_are_read(tmp_path):
+    for folder in ("run/CartPole-v1", "run/checkpoints/checkpoint-1", "other", "mine/checkpoint-1"):
+        (tmp_path / folder).mkdir(parents=True)
+    for name, gamma in (("run/CartPole-v1", 0.9), ("other", 0.5)):
+        (tmp_path / name / "config.yml").write_text(f"gamma: {gamma}")
+        (tmp_path / name / "args.yml").write_text("n_timesteps: 7")
+    of_run = {"gamma": 0.9, "n_timesteps": 7}
+    expected = {
+        "run": of_run,
+        "run/checkpoints": of_run,
+        "run/checkpoints/checkpoint-1": of_run,
+        "mine": None,
+        "mine/checkpoint-1": None,
+    }
+    for path, entry in expected.items():
+        assert config_of(tmp_path / path, trust=True) == entry, path
+
+
 def test_an_interrupted_run_is_resumed_exactly(sb3_eqr, tmp_path):
     line = f"train --algo eqr_qrdqn --env CartPole-v1 -n 1300 --eval-freq -1 -f {tmp_path}"
     sb3_eqr(f"{line} --seed 1 --checkpoint-every 500 -params learning_starts:100 gradient_steps:16")
