@@ -66,10 +66,22 @@ ZOO, ATARI = ["zoo.jsonl.xz", "lunarlander_variants.jsonl.xz"], ["atari100k/gpu.
 FIRST_PAGE = (["first_page.jsonl.xz"], ["torus_of_8"], ("eqr_qrdqn:aet_5", "eqr_qrdqn:plain"), "goals")
 NOISE = ["continuous_early.xz", "continuous_short.xz"]
 EARLY = "area2000-12000", "continuous.md#in-12000-steps"  # after the random steps
+LATE = ["continuous_gate.xz", "continuous.xz"]
 COMPARED: list[Arguments] = [
     *(
         (f"{task}, EqRSAC", ["continuous_early.xz"], [f"{task}-v5"], ("eqr_sac", "sac"), *EARLY)
         for task in ("HalfCheetah", "Ant", "Walker2d", "Hopper", "Humanoid")
+    ),
+    *(
+        (
+            f"{task}, 100,000 steps, EqRSAC",
+            LATE,
+            [f"{task}-v5"],
+            ("eqr_sac", "sac"),
+            "area0-100000",
+            "continuous.md#in-100000-steps",
+        )
+        for task in ("HalfCheetah", "Ant", "Walker2d", "Hopper")
     ),
     (
         "Pendulum from images, EqRSAC",
