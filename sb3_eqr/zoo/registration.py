@@ -48,14 +48,12 @@ def sample_eqr_params(
         "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
         "noisy": trial.suggest_categorical("noisy", [False, True]),
     }
-    if categorical:
-        sampled["return_range"] = trial.suggest_categorical("return_range", [10, 30, 100, 200, 400])
     batch_size, train_freq = 2 ** sampled.pop("batch_size_pow"), 2 ** sampled.pop("train_freq_pow")
     policy_kwargs = {**kept, **{name: sampled.pop(name) for name in ("group", "n_blocks", "net_arch", "noisy")}}
     policy_kwargs["net_arch"] = NET_ARCHS[policy_kwargs["net_arch"]]
     if categorical:
-        policy_kwargs["v_max"] = float(sampled.pop("return_range"))
-        policy_kwargs["v_min"] = -policy_kwargs["v_max"]
+        v_max = float(trial.suggest_categorical("return_range", [10, 30, 100, 200, 400]))
+        policy_kwargs |= {"v_min": -v_max, "v_max": v_max}
     return {
         "gamma": 1 - sampled.pop("one_minus_gamma"),
         "batch_size": batch_size,

@@ -169,7 +169,7 @@ def test_a_given_group_encoder_gets_the_group_arguments(make):
     assert (str(encoder.group_layer.group), encoder.group_layer.n_blocks) == ("SO(3)", 2)
     own["features_extractor_kwargs"] = {"group": "T(2)"}
     assert str(make(ChainEnv(), policy_kwargs=own).policy.online.features_extractor.group_layer.group) == "T(2)"
-    for group, n_blocks in {"T(2)": 32, "T(3)": 21, "T(72)": 1, "T(72)^3": 3}.items():  # 64 numbers
+    for group, n_blocks in {"T(2)": 32, "T(3)": 21, "T(72)": 1, "T(72)^3": 3}.items():  # T(2): Table 5
         policy = make(ChainEnv(), policy_kwargs={"group": group, "n_blocks": None}).policy
         assert policy.latent_model.n_blocks == n_blocks, group
 
