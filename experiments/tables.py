@@ -41,6 +41,7 @@ Row = dict[str, Any]
 Arguments = tuple[str, list[str], list[str], tuple[str, str], str, str]  # of ``compare``
 PARTS = 10  # of a run, for the return at its end and for figures
 SPR = "SPR (rliable, 100 runs)"  # in reference_scores.csv
+PAPER = "EqR, L_R + L_{GET} [EqR Tab2]", "SPR [EqR Tab2]"  # the paper's agent with all losses, and the one that it compares
 WIDTH, DPI = 3.9, 200  # of figures, in inches and dots per inch
 AXES = {
     "score": "mean score of the evaluation episodes",
@@ -407,13 +408,15 @@ def claim(rows: list[Row], agents: tuple[str, str], games: list[str]) -> str:
     """
     The endpoint of ``experiments/settings/atari``: differences in standard deviations of 100 published runs of SPR, and their
     mean over games with its 95% interval (Student's t over games). Where a run was stopped, both agents' games in training
-    from step 55,000 to 75,000 are compared.
+    from step 55,000 to 75,000 are compared. Beside it, in the same units, how far the paper's agent is above its SPR.
 
     :param agents: with EqR and without it
     :return: Markdown, a row per game that both have, the mean last
     """
     reference = load_reference()
     spreads = reference[reference["method"] == SPR].set_index("game")["sd"]
+    published = reference.pivot(index="game", columns="method", values="mean")
+    gains = (published[PAPER[0]] - published[PAPER[1]]) / spreads
     lines, found = [], []
     for game in games:
         of_game = [[row for row in rows if (row["agent"], row["game"]) == (agent, game)] for agent in agents]
@@ -425,11 +428,13 @@ def claim(rows: list[Row], agents: tuple[str, str], games: list[str]) -> str:
         means, spread = [float(one.mean()) for one in values], float(spreads[game.lower()])
         found.append((means[0] - means[1]) / spread)
         measured = "training" if is_stopped else "final"
-        lines.append([game, measured, str(min(map(len, values))), *map(text, (*means, spread, found[-1]))])
+        numbers = *means, spread, found[-1], float(gains[game.lower()])
+        lines.append([game, measured, str(min(map(len, values))), *map(text, numbers)])
     half = student.ppf(0.975, len(found) - 1) * np.std(found, ddof=1) / np.sqrt(len(found)) if len(found) > 1 else np.nan
     mean = float(np.mean(found))
-    lines.append(["mean", "", "", "", "", "", f"{text(mean)} [{text(mean - half)}, {text(mean + half)}]"])
-    return markdown(["game", "games", "seeds", "with EqR", "without", "SD of SPR", "difference in these"], lines)
+    paper = text(float(gains[[line[0].lower() for line in lines]].mean()))
+    lines.append(["mean", "", "", "", "", "", f"{text(mean)} [{text(mean - half)}, {text(mean + half)}]", paper])
+    return markdown(["game", "games", "seeds", "with EqR", "without", "SD of SPR", "difference in these", "paper's"], lines)
 
 
 def published() -> str:
