@@ -35,10 +35,10 @@ from torch import nn
 
 from experiments import markdown
 from experiments.tables import PARTS, area, difference, draw, mean_and_error
-from sb3_eqr import EqRSAC, EqRTQC, ExactCheckpointCallback
-from sb3_eqr.common.actor_critic import EqRActorCritic
+from sb3_eqr import EqRSAC, EqRTQC
+from sb3_eqr.benchmark.training import load_checkpoint
 from sb3_eqr.common.augmentations import random_shift
-from sb3_eqr.common.saving.checkpoints import find_checkpoints
+from sb3_eqr.common.saving.checkpoints import find_checkpoints, write_checkpoint
 from sb3_eqr.common.saving.files import atomic_write
 
 PIXELS, N_TORQUES, SHIFT = "PixelPendulum-v0", 201, 3  # EqRSAC shifts images of 48 pixels by up to 3
@@ -135,9 +135,20 @@ POLICIES = {"sac_layer_norm": LayerNormPolicy, "drq": OneEncoderPolicy}
 
 
 class Episodes(BaseCallback):
-    """Collect the step, return and length of each training episode, and the CPU seconds, as attributes of the model."""
+    """
+    Collect the step, return and length of each training episode, and the CPU seconds, as attributes of the model; write
+    checkpoints into a folder.
+    """
 
     model: Any
+
+    def __init__(self, folder: pathlib.Path):
+        super().__init__()
+        self.folder = folder
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps and self.num_timesteps % N_BETWEEN == 0:
+            write_checkpoint(self.folder, self.model)
 
     def _on_training_start(self) -> None:
         if not hasattr(self.model, "episodes"):
@@ -193,22 +204,20 @@ def make_agent(arm: str, task: str, seed: int, is_short: bool) -> SAC | TQC | Cr
 def train(
     folder: pathlib.Path, tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], is_short: bool, steps: int | None
 ) -> None:
-    """Run what is not in the folder, seed by seed, task by task, arm by arm. EqRSAC's runs can be stopped at any time."""
+    """Run what is not in the folder, seed by seed, task by task, arm by arm. Runs can be stopped at any time."""
     steps = steps or (N_SHORT if is_short else N_STEPS)
     for seed, task, arm in ((seed, task, arm) for seed in seeds for task in tasks for arm in arms):
         file = folder / f"{arm}-{task}-{seed}.json"
         if file.exists():
-            if (found := json.loads(file.read_text())["steps"]) != steps:
-                raise ValueError(f"{file} must have {steps} steps, got {found}. Use a folder for each number of steps.")
+            if (there := json.loads(file.read_text())["steps"]) != steps:
+                raise ValueError(f"{file} must have {steps} steps, got {there}. Use a folder for each number of steps.")
             continue
         model: Any = make_agent(arm, task, seed, is_short)
-        callbacks: list[BaseCallback] = [Episodes()]
-        if isinstance(model, EqRActorCritic):
-            checkpoints = file.with_suffix("")
-            if find_checkpoints(checkpoints):
-                model = type(model).resume(checkpoints, make_env(task), device="cpu")
-            callbacks.append(ExactCheckpointCallback(N_BETWEEN, checkpoints, keep=1))
-        model.learn(steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=model.num_timesteps == 0)
+        checkpoints = file.with_suffix("")
+        if found := find_checkpoints(checkpoints):
+            model, *_ = load_checkpoint(found[-1], model)
+        begins = model.num_timesteps == 0
+        model.learn(steps - model.num_timesteps, callback=Episodes(checkpoints), reset_num_timesteps=begins)
         model.save(file.with_suffix(".zip"))  # for sb3-eqr visualize
         tests = make_vec_env(lambda task=task: make_env(task), seed=N_STEPS)  # type: ignore[misc]
         greedy, _ = evaluate_policy(model, tests, n_eval_episodes=N_GREEDY, return_episode_rewards=True)
@@ -216,7 +225,7 @@ def train(
         run |= {"torch": th.__version__, "greedy": greedy, "training": model.episodes}
         with atomic_write(file, "json") as out:
             out.write(json.dumps(run).encode())
-        shutil.rmtree(file.with_suffix(""), ignore_errors=True)
+        shutil.rmtree(checkpoints, ignore_errors=True)
         print(task, arm, seed, round(area(run)), f"{run['seconds']} s", flush=True)
 
 
