@@ -50,7 +50,7 @@ class EqRRainbow(EqRAlgorithm, DQN):
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         settled = self._vec_normalize_env is None or self.num_timesteps > self.learning_starts  # its scale varies at first
-        if settled and not self._warned_of_returns:
+        if settled and self.td_coef > 0 and not self._warned_of_returns:
             self._watch_returns(reward, dones)
 
     def _watch_returns(self, reward: np.ndarray, dones: np.ndarray) -> None:

@@ -276,6 +276,7 @@ class ScriptedRewards(ChainEnv):
         return self.observe() * 0, self.rewards[self.time - 1], self.time == len(self.rewards), False, {}
 
 
+@pytest.mark.parametrize("td_coef", [1.0, 0.0])  # without a TD loss, nothing learns returns
 @pytest.mark.parametrize(
     "rewards, step, value",
     [
@@ -286,13 +287,14 @@ class ScriptedRewards(ChainEnv):
         ([1.0] * 10, None, None),  # 9.56
     ],
 )
-def test_returns_outside_the_support_warn_once(rewards, step, value):
-    model = EqRRainbow("MlpPolicy", make_vec_env(lambda: ScriptedRewards(rewards)), learning_starts=1_000, device="cpu")
+def test_returns_outside_the_support_warn_once(rewards, step, value, td_coef):
+    env = make_vec_env(lambda: ScriptedRewards(rewards))
+    model = EqRRainbow("MlpPolicy", env, learning_starts=1_000, td_coef=td_coef, device="cpu")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model.learn(3 * len(rewards))
     found = [str(warning.message) for warning in caught if "discounted return" in str(warning.message)]
-    if step is None:
+    if step is None or td_coef == 0:
         assert found == []
     else:
         assert len(found) == 1 and f"step {step}: a discounted return of {value} lies outside" in found[0]
