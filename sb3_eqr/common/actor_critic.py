@@ -45,7 +45,7 @@ RULES = {
     "top_quantiles_to_drop_per_net": integer(0),  # of TQC
 }
 LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")  # of SB3, means over a round
-SCALE_INTERVAL = 1_000  # updates between two estimates of the rewards' spread, each of which takes all rewards
+SCALE_INTERVAL = 1_000  # updates or steps between two estimates of the rewards' spread, each of which takes all rewards
 MIN_REWARDS = 100  # for an estimate
 MIN_SPREAD = 1e-4  # as a share of the largest reward; below, it may be rounding
 MAX_REWARD = 10.0  # spreads from the mean, as VecNormalize's clip_reward: a first rare reward is far beyond the last estimate
@@ -59,6 +59,7 @@ class EqRActorCritic(EqROffPolicy):
     """
 
     policy: EqRActorCriticPolicy
+    _scaled_at: int | None = None  # the step of the last estimate of the rewards' spread
     rules = RULES
     _check_action_space = staticmethod(validation.check_continuous_actions)
 
@@ -209,7 +210,9 @@ class EqRActorCritic(EqROffPolicy):
         """Estimate mean and standard deviation of the rewards, as VecNormalize scales them, again, if it is due."""
         rewards = buffer.rewards[: buffer.size()]
         is_due = -self._n_updates % SCALE_INTERVAL < gradient_steps or rewards.size < SCALE_INTERVAL
+        is_due |= self._scaled_at is None or abs(self.num_timesteps - self._scaled_at) >= SCALE_INTERVAL  # with rare updates
         if is_due and rewards.size >= MIN_REWARDS:
+            self._scaled_at = self.num_timesteps
             self.reward_mean, self.reward_scale = moments(buffer._normalize_reward(rewards, self._vec_normalize_env))
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -38,6 +38,7 @@ from sb3_eqr.common.latent.options import LatentOptions
 from sb3_eqr.common.networks.encoders import (
     ConvExtractor,
     DictExtractor,
+    ImageExtractor,
     TwoLayerExtractor,
     find_trunk,
     is_flat,
@@ -277,12 +278,15 @@ class EqRActorCriticPolicy(BasePolicy):
             kwargs["optimizer_kwargs"] = {"fused": can_fuse(given), **given}
         if features_extractor_class is None:
             features_extractor_class = self.default_trunk_class if self.has_latent else self.stock_extractor_class
+        extractor_class, extractor_kwargs = find_trunk(features_extractor_class), dict(features_extractor_kwargs or {})
+        if not kwargs.get("normalize_images", True) and issubclass(extractor_class, (ImageExtractor, DictExtractor)):
+            extractor_kwargs["normalized_image"] = True  # as SB3 does for its own
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,  # type: ignore[arg-type]
-            features_extractor_class=find_trunk(features_extractor_class),
-            features_extractor_kwargs=dict(features_extractor_kwargs or {}),  # a copy, because SB3 changes it
+            features_extractor_class=extractor_class,
+            features_extractor_kwargs=extractor_kwargs,
             **kwargs,
         )
 

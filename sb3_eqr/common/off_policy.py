@@ -175,12 +175,16 @@ class EqROffPolicy(FiniteData, SafeFiles):
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        As SB3's ``set_parameters``; raises ValueError if a file is for another group or return distribution, or if the moments
-        of the optimiser do not fit its parameters. After an error, all parameters are as before.
+        As SB3's ``set_parameters``, and from a file also the scale of the rewards that the latent model predicts. Raises
+        ValueError if a file is for another group or return distribution, or if the moments of the optimiser do not fit its
+        parameters. After an error, all parameters are as before.
         """
+        scale: dict[str, float] = {}
         if not isinstance(load_path_or_dict, dict):
             content = read_model(load_path_or_dict)
-            validation.check_same_parameters(self.policy_description, data_of(content).get("policy_description", {}))
+            saved = data_of(content)
+            validation.check_same_parameters(self.policy_description, saved.get("policy_description", {}))
+            scale = {name: float(saved[name]) for name in ("reward_mean", "reward_scale") if name in saved}
             load_path_or_dict = io.BytesIO(content)  # type: ignore[assignment]
         self._monitor.forget()
         before: Any = copy.deepcopy(self.get_parameters())
@@ -191,6 +195,7 @@ class EqROffPolicy(FiniteData, SafeFiles):
         except Exception:
             super().set_parameters(before)  # PyTorch copies the tensors that fit before it raises
             raise
+        vars(self).update(scale)
         for parameter, state in (item for optimizer in self._optimizers() for item in optimizer.state.items()):
             for name, value in state.items():
                 if isinstance(value, th.Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():

@@ -308,11 +308,35 @@ def test_a_reward_far_beyond_the_last_estimate_counts_as_ten_spreads(agent, loss
 @EACH
 def test_a_round_of_updates_that_passes_an_interval_estimates_the_spread(agent):
     model = make(agent, buffer_size=2_000, learning_starts=1_100).learn(1_100)
-    model._n_updates, model.reward_scale = 995, 5.0
+    model._n_updates, model.reward_scale, model._scaled_at = 995, 5.0, 1_100
     model.train(3, 8)
     assert model.reward_scale == 5.0
     model.train(5, 8)  # update 1,000 is the third of these
     assert model.reward_scale == pytest.approx(model.replay_buffer.rewards[:1_100].std(), rel=1e-5)
+
+
+@EACH
+def test_the_spread_is_estimated_when_updates_are_rare(agent):
+    """The rewards are 0, 1, 2, ...; the updates of steps 500 and 1,500 are a thousand steps apart."""
+
+    def counting():
+        rewards = itertools.count()
+        return gym.wrappers.TransformReward(MoveEnv(), lambda _: next(rewards))
+
+    model = make(agent, counting(), buffer_size=4_000, train_freq=500).learn(2_000)
+    assert model._n_updates == 4 and model.reward_mean == 749.5
+    late = make(agent, counting(), buffer_size=4_000, train_freq=60).learn(60)  # an update with too few rewards
+    late.train_freq = 1_040
+    late.learn(1_040, reset_num_timesteps=False)
+    assert late._n_updates == 2 and late.reward_mean == 549.5
+
+
+@EACH
+def test_parameters_from_a_file_bring_the_scale_of_their_rewards(agent, tmp_path):
+    model, other = make(agent, learning_starts=100).learn(130), make(agent)
+    model.save(tmp_path / "model")
+    other.set_parameters(tmp_path / "model")
+    assert (other.reward_mean, other.reward_scale) == (model.reward_mean, model.reward_scale) != (0.0, 1.0)
 
 
 @PAIRS
@@ -598,6 +622,8 @@ def test_float_images_and_other_optimisers(agent):
     env = gym.wrappers.TransformObservation(MoveEnv(IMAGE), lambda image: (image / 255).astype(np.float32), floats)
     model = make(agent, env, "CnnPolicy", policy_kwargs={"normalize_images": False, "optimizer_kwargs": {"foreach": True}})
     assert model.learn(34)._n_updates == 4
+    plain = {"head_input": "observation", "normalize_images": False, "features_extractor_class": "nature"}
+    assert make(agent, env, "CnnPolicy", prediction_depth=0, policy_kwargs=plain).learn(34)._n_updates == 4
 
 
 class Centred(BaseFeaturesExtractor):

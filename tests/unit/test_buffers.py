@@ -362,6 +362,34 @@ def test_the_zeros_of_padding_are_never_overwritten():
         assert found.ravel().tolist() == stack
 
 
+@pytest.mark.parametrize("name", ["_release", "_take_slots", "_put"])
+def test_a_step_that_is_interrupted_damages_no_other(name, monkeypatch):
+    """Of a full ring: its position keeps the zeros until it is written again, in an episode of its own."""
+    store = FrameStore(8, 1, (1,), np.dtype(np.int64))
+
+    def add(i, obs):
+        store.add(i % 8, np.array([[obs]]), np.array([[obs + 1]]), overwrite=i >= 8)
+
+    for i in range(11):
+        add(i, i)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        original = getattr(store, name)
+
+        def interrupted(*args):
+            original(*args)
+            raise KeyboardInterrupt
+
+        patch.setattr(store, name, interrupted)
+        add(11, 11)
+    for i in range(11, 17):
+        add(i, 100 + i)
+        positions = np.arange(8)
+        shown = [int(j) if j < 11 else int(100 + j) for j in i - (i - positions) % 8]
+        for following in (False, True):
+            found = store.observations(positions, np.zeros(8, int), following).ravel().tolist()
+            assert found == [value + following for value in shown]
+
+
 def test_a_first_stack_may_hold_any_frames():
     """Only neighbours that are equal share a slot."""
     store = FrameStore(4, 1, (4, 1), np.dtype(np.uint8), n_stack=4)

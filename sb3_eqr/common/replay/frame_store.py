@@ -95,7 +95,9 @@ class FrameStore:
                 'replay_buffer_kwargs={"frame_stack": 1} to store observations without splitting them into frames.'
             )
         if overwrite:
-            self._release(self._ids[position])
+            old = self._ids[position].copy()
+            self._ids[position] = _ZERO  # after Ctrl-C, they must not be released again
+            self._release(old)
         before = self._ids[position - 1]
         last = self._gathered(before[:, 1:]).numpy(force=True) if self._last is None else self._last
         continues = (_bits(last) == _bits(stacks)).reshape(len(stacks), -1).all(axis=1)
@@ -105,9 +107,9 @@ class FrameStore:
             ids[env, :-1] = self._store_stack(stacks[env])
         ids[:, -1] = self._take_slots(len(stacks))
         self._put(ids[:, -1], next_stacks[:, -1])
-        self._last = next_stacks.copy()
         np.add.at(self._references, ids, 1)
         self._ids[position] = ids
+        self._last = next_stacks.copy()
         return continues
 
     def observations(self, positions: np.ndarray, envs: np.ndarray, following: bool) -> th.Tensor:
