@@ -242,6 +242,11 @@ class EqRAlgorithm(EqROffPolicy):
         graph = (self._update, self.policy.optimizer, self._settings_of_update)
         self._captured = CapturedUpdate(*graph) if self.cuda_graph else None
 
+    def _follow_options(self) -> None:
+        """Set up the objective again if its options have changed, by the user or by a callback."""
+        if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):
+            self._set_up_objective()
+
     def _options_of_objective(self) -> dict[str, Any]:
         names = ("double_q", "shift_pixels", "intensity_scale", "aux_gradient_share")
         options = {name: getattr(self, name) for name in names}
@@ -292,8 +297,7 @@ class EqRAlgorithm(EqROffPolicy):
         self._resets.schedule = self.resets = ResetSchedule.of(self.resets)
         self._check_losses()
         self._make_exploration_schedule()
-        if self._objective_options != self._options_of_objective() or self.cuda_graph != (self._captured is not None):
-            self._set_up_objective()
+        self._follow_options()
         result = super()._setup_learn(*args, **kwargs)
         if self.learning_starts is None and self._total_timesteps > 0:
             self.learning_starts = min(int(self._total_timesteps) // 10, MAX_LEARNING_STARTS)
@@ -321,6 +325,7 @@ class EqRAlgorithm(EqROffPolicy):
         :param gradient_steps: number of updates
         :param batch_size: B
         """
+        self._follow_options()
         buffer, update = self.replay_buffer, self._captured or self._update
         assert buffer is not None
         self._start_round(buffer)
@@ -381,8 +386,10 @@ class EqRAlgorithm(EqROffPolicy):
             return math.ceil(steps / per_round) * (per_round if self.gradient_steps < 0 else self.gradient_steps)
         if self.gradient_steps < 0:
             return steps
-        episodes = self._episode_num / self.num_timesteps if self.num_timesteps else np.nan  # per step; not known at first
-        return self.gradient_steps * episodes / frequency.frequency * steps
+        if self.num_timesteps == 0:
+            return np.nan  # the length of episodes is not known
+        episodes = steps * self._episode_num / self.num_timesteps
+        return self.gradient_steps * math.ceil(episodes / frequency.frequency)
 
     def _start_round(self, buffer: SequenceReplayBuffer) -> None:
         self._log_last_round()

@@ -113,6 +113,21 @@ def test_sb3s_callbacks_continue_in_a_resumed_run(tmp_path):
     assert new.n_calls == 3 and not new.evaluations_results
 
 
+def test_evaluations_with_noise_continue_in_a_resumed_run(tmp_path):
+    """They draw from the generators of training, as often as their episodes are long."""
+
+    def learn(model, n_steps):
+        evaluation = EvalCallback(
+            make_vec_env("CartPole-v1", seed=9), eval_freq=20, deterministic=False, log_path=tmp_path / "log", verbose=0
+        )
+        callbacks = [evaluation, ExactCheckpointCallback(50, tmp_path / "run")]
+        return model.learn(n_steps, callbacks, reset_num_timesteps=model.num_timesteps == 0), evaluation.evaluations_length
+
+    whole, lengths = learn(EqRQRDQN("MlpPolicy", make_vec_env("CartPole-v1"), **SMALL), 99)
+    resumed, found = learn(EqRQRDQN.resume(tmp_path / "run", make_vec_env("CartPole-v1")), 49)
+    assert same(whole, resumed) and found == lengths and len(lengths) == 4
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("written")

@@ -151,6 +151,22 @@ def test_the_last_round_is_whole_and_counts_for_resets(make, n_envs, train_freq,
     assert model._n_updates == 256 and model._resets.done == [64, 128, 192]
 
 
+class Thirteen(ChainEnv):
+    """All episodes have 13 steps."""
+
+    def step(self, action):
+        self.position = 0.0
+        observation, reward, *_ = super().step(action)
+        return observation, reward, self.time == 13, False, {}
+
+
+def test_the_last_episode_is_whole_and_counts_for_resets(make):
+    """Episodes of 13 steps, of which the tenth ends at step 130: 7 updates after each."""
+    rounds = {"train_freq": (1, "episode"), "gradient_steps": 7, "learning_starts": 0, "resets": {"interval": 10}}
+    model = make(Thirteen(), **rounds).learn(120)
+    assert model._n_updates == 70 and model._resets.done == [10, 20, 30, 40, 50, 60]
+
+
 @pytest.mark.parametrize("alpha, projection", [(0.5, "head"), (0.2, "own"), (0.0, "none"), (1.0, "head")])
 def test_a_reset_bit_for_bit(make, alpha, projection):
     network = PAPER if projection == "head" else {"projection": projection}

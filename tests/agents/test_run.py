@@ -245,6 +245,20 @@ def test_a_custom_extractor_becomes_the_trunk(make, network):
     assert model.policy.group_layer.to_algebra.in_features == 512
 
 
+@EITHER
+def test_options_that_a_callback_changes_hold_from_the_next_round(make):
+    """With tau=1, the online encoder serves as the target's; a target that moves slowly has its own."""
+    model = make(ChainEnv())
+
+    def change(_locals, _globals):
+        if model.num_timesteps == 44:
+            model.tau, model.double_q = 0.1, False
+        return True
+
+    model.learn(46, change)
+    assert model.objective.target_encoder is model.policy.target.features_extractor and not model.objective.double_q
+
+
 @POLICIES
 @pytest.mark.parametrize("algorithm, network", [(QRDQN, "quantile_net"), (DQN, "q_net"), (PPO, None)])
 def test_the_group_encoder_works_with_stock_algorithms(algorithm, network, env, policy):

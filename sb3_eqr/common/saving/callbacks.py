@@ -1,6 +1,10 @@
-"""What SB3's callbacks have counted and measured so far, which SB3 does not save: a resumed run continues from there."""
+"""
+What SB3's callbacks have counted and measured so far, and the environments that they evaluate in, which SB3 does not save: a
+resumed run continues from there.
+"""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 from stable_baselines3.common.callbacks import (
@@ -12,6 +16,8 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
+
+from sb3_eqr.common.saving.env_state import capture, restore
 
 PROGRESS = {
     BaseCallback: ("n_calls",),
@@ -47,17 +53,21 @@ def names_of(callback: BaseCallback) -> list[str]:
 def progress_of(callback: BaseCallback) -> dict[str, list[dict[str, Any]]]:
     """
     :param callback: the one of ``learn``, with all that it calls
-    :return: the attributes of each callback, in order, by the name of its class
+    :return: the attributes of each callback, in order, by the name of its class; "eval_env" is the state of its environments
     """
     found: dict[str, list[dict[str, Any]]] = {}
     for one in each(callback):
-        found.setdefault(type(one).__name__, []).append({name: getattr(one, name) for name in names_of(one)})
+        state = {name: getattr(one, name) for name in names_of(one)}
+        if isinstance(one, EvalCallback):
+            environments, unknown = capture(one.eval_env)
+            state |= {} if unknown else {"eval_env": environments}
+        found.setdefault(type(one).__name__, []).append(state)
     return found
 
 
 def restore_progress(callback: BaseCallback, progress: dict[str, list[dict[str, Any]]]) -> None:
     """
-    Restore what :func:`progress_of` returned; of several callbacks of a class, the first continues the first, and so on. New
+    Restore what :func:`progress_of` returned. Of several callbacks of a class, the first continues the first, and so on. New
     ones begin.
     """
     left = {name: iter(states) for name, states in progress.items()}
@@ -66,3 +76,7 @@ def restore_progress(callback: BaseCallback, progress: dict[str, list[dict[str, 
         for name in names_of(one):
             if isinstance(state.get(name), type(getattr(one, name))):
                 setattr(one, name, state[name])
+        if isinstance(one, EvalCallback) and "eval_env" in state:
+            one.eval_env.reset()  # some environments create their attributes only here
+            with suppress(ValueError):  # others than before begin anew
+                restore(one.eval_env, state["eval_env"], wrappers_only=False)
